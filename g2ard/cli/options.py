@@ -32,6 +32,14 @@ SceneArgument = Annotated[
         help="Scene: .ply (3DGS), SOG, .spz, .glb, .splat, .ksplat, .compressed.ply or OpenUSD.",
     ),
 ]
+OthersArgument = Annotated[
+    list[Path] | None,
+    typer.Argument(
+        metavar="[SCENE…]",
+        help="Further scenes or point clouds of the same place. A folder of point clouds is one, too.",
+        show_default=False,
+    ),
+]
 ViewsOption = Annotated[
     Path | None,
     typer.Option(

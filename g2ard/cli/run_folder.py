@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
@@ -40,9 +39,8 @@ from g2ard.viewer.page import write_page
 
 if TYPE_CHECKING:
     from g2ard.jobs.distill import DistillJob, RunTargets
-    from g2ard.jobs.in_tiles import TiledDistilled, TiledJob
     from g2ard.pipeline.distill import Distilled
-    from g2ard.report.run import RunReport, TiledReport
+    from g2ard.report.run import RunReport
 
 _WORK_FOLDER = ".unfinished"
 """Folder in a run's folder for finished rounds and checkpoints."""
@@ -118,10 +116,10 @@ class RunFolder:
         return [name for name, lacks in asked.items() if lacks]
 
     @contextmanager
-    def held(self, job: DistillJob | TiledJob) -> Iterator[None]:
+    def held(self, job: DistillJob) -> Iterator[None]:
         """Create the folder, where no other run may write meanwhile; an empty folder is removed.
 
-        In one piece, it holds checkpoints too, which are kept after an error or Ctrl-C.
+        It holds checkpoints too, which are kept after an error or Ctrl-C.
         """
         self._inputs = identities([*self._run.input_files(), *job.photos])
         made = [] if self.path.exists() else [self.path]
@@ -131,25 +129,13 @@ class RunFolder:
                 if self.scene.exists() and not (self._run.overwrite or left_at(self.unfinished)):
                     raise OutputError("exists", path=self.path, hint="{overwrite=True} replaces it")
                 drop_temporaries(self.path)
-                with self._marked() if job.tiles else self._checkpoints(job):
+                with self._checkpoints(job):
                     yield
         finally:
             drop_empty(made)
 
     @contextmanager
-    def _marked(self) -> Iterator[None]:
-        """Mark the folder until its files are written; the finished steps are elsewhere."""
-        if self.unfinished.exists() and not self._resume:
-            shutil.rmtree(self.unfinished)
-        self.unfinished.mkdir(exist_ok=True)
-        try:
-            yield
-            shutil.rmtree(self.unfinished)
-        finally:
-            drop_empty([self.unfinished])
-
-    @contextmanager
-    def _checkpoints(self, job: DistillJob | TiledJob) -> Iterator[None]:
+    def _checkpoints(self, job: DistillJob) -> Iterator[None]:
         """Create the folder for checkpoints; after an error or Ctrl-C, keep what it holds."""
         if self._resume and not left_at(self.unfinished):
             self._run.say(f"{self.path}: nothing to resume, starting over")
@@ -160,19 +146,16 @@ class RunFolder:
             (self.unfinished / OPTIONS).write_text(text, encoding="utf-8", newline="\n")
             yield
 
-    def write(
-        self, done: Distilled | TiledDistilled, views: RunViews, targets: RunTargets | None = None
-    ) -> None:
+    def write(self, done: Distilled, views: RunViews, targets: RunTargets) -> None:
         """Write the scene, with --keep the simplified one, and the views with their splits.
 
         An earlier run's scenes and the pages about them are removed. Generated views are also written in the
-        format of --views-format, and all scored views if some of `targets` are of other kinds. Without
-        targets, which score the file later, a lossy file is compared with the scene.
+        format of --views-format, and all scored views if some of `targets` are of other kinds.
         """
         run = self._run
         if self.unfinished.is_dir():
             (self.unfinished / "written").touch()  # from now on, --resume may replace this run's files
-        run.write(self.scene, done.splats, overwrite=True, compare=targets is None)
+        run.write(self.scene, done.splats, overwrite=True, compare=False)
         pages = (self.path / name for name in ("report.json", "report.html", _PICTURE, "view.html"))
         for other in (*self._other_scenes(), *pages):
             other.unlink(missing_ok=True)
@@ -189,30 +172,25 @@ class RunFolder:
         also: ViewFormat = run.config["views_format"]
         if views.pool is not None and also in _VIEW_FILES:
             run.write_views(self.path / _VIEW_FILES[also], own.cameras, also, own.splits, overwrite=True)
-        if targets is None or targets.apart is None:
+        if targets.apart is None:
             self._scored.unlink(missing_ok=True)
             return
         scored = _joined(targets.apart.cameras, targets.held_out.cameras)
         write_views(self._scored, scored, splits=["test"] * len(scored), overwrite=True)
 
     def write_pages(
-        self, source: Source | Path, job: Any, done: Any, report: RunReport | TiledReport, told: Sequence[str]
-    ) -> tuple[RunReport | TiledReport, str]:
-        """Write report.html and, in one piece, preview.png and with --page view.html; return the report with
-        the size of that page, and a line about it.
+        self, source: Source | Path, job: Any, done: Any, report: RunReport, told: Sequence[str]
+    ) -> tuple[RunReport, str]:
+        """Write report.html, preview.png and with --page view.html; return the report with the size of that
+        page, and a line about it.
 
         Args:
             source: what was distilled.
             told: the summary that the command prints.
         """
-        from g2ard.report.distilled import distill_report, preview, tiled_report
-        from g2ard.report.run import TiledReport
+        from g2ard.report.distilled import distill_report, preview
 
         title = f"{names_of([Path(str(source))])[0]}: {report.title}"
-        if isinstance(report, TiledReport):
-            with self._run.showing("report.html"):
-                tiled_report(self.path / "report.html", title, report)
-            return report, ""
         scenes = [] if report.photos else [("simplified", done.simplified)]  # a start of photos is a blur
         scenes.append((RESULT, done.splats))
         targets = list(filter(None, (done.held_out, job.targets.apart)))
@@ -228,7 +206,9 @@ class RunFolder:
             preview(self.path / _PICTURE, best, scenes, recover.background)
         if not self._run.config["page"]:
             return report, ""
-        dense = (source, job.prior) if isinstance(source, Source) and not recover.from_points else None
+        dense = None
+        if isinstance(source, Source) and not recover.from_points and job.plan is None:
+            dense = source, job.prior
         seen = job.views.train.cameras if job.views.pool is None else best.cameras
         size, line = None, ""
         with self._run.showing("view.html"):

@@ -15,8 +15,8 @@ if TYPE_CHECKING:
     from g2ard.jobs.budget import Budget
     from g2ard.jobs.budget_search import ResolvedBudget
     from g2ard.jobs.cost import Cost
-    from g2ard.jobs.in_tiles import Tiles
-    from g2ard.report.run import KindScore, RunReport, TiledReport, ViewsReport
+    from g2ard.jobs.memory import TilePlan
+    from g2ard.report.run import KindScore, RunReport, ViewsReport
     from g2ard.scene.splats import Splats
 
 _REPORTED_PSNR_LOSS, _REPORTED_SSIM_LOSS = 0.05, 0.001
@@ -30,7 +30,7 @@ _LEAST_REPORTED_SHARE = 0.005
 
 
 def tell_run(
-    run: Run, source: Path, job: Any, done: Any, report: RunReport | TiledReport, folder: RunFolder, page: str
+    run: Run, source: Path, job: Any, done: Any, report: RunReport, folder: RunFolder, page: str
 ) -> None:
     """Print the summary of a run and write its result.
 
@@ -38,44 +38,42 @@ def tell_run(
         source: what was distilled.
         page: line about the page.
     """
-    from g2ard.report.run import COLUMNS, RunReport, cells
+    from g2ard.report.run import COLUMNS, cells
 
-    if isinstance(report, RunReport):
-        run.say(counts_line(report))
+    run.say(counts_line(report))
     title = f"held-out views against {report.against}, {report.size}, {report.stages}:"
     run.console.table(title, list(COLUMNS), cells(report.kinds))
     for line in told(report, verbose=run.verbose):
         run.say(line)
-    if isinstance(report, RunReport):
-        say_views(run, report.views, job.config.select.views_count is not None)
-        if not job.config.recover.from_points:  # such points are no scene to compare with
-            say_weight(run, source, folder.scene, done.splats, lifted=job.prior if job.lifted else None)
-    else:
-        scores = report.scores
-        run.say(
-            f"{folder.path}: {report.output_count:,} of {report.input_count:,} Gaussians; over all pixels "
-            f"{scores.simplified:.2f} → {scores.recovered:.2f} dB; "
-            f"{plural(scores.steps, 'step')} in all tiles together"
-        )
+    say_views(run, report.views, job.config.select.views_count is not None)
+    if not job.config.recover.from_points:  # such points are no scene to compare with
+        lifted = job.prior if job.lifted and job.plan is None else None
+        say_weight(run, source, folder.scene, done.splats, lifted=lifted)
     folder.say_files(page)
     run.result(report.as_dict())
     tell_quality(run, job.budget, done.splats)
 
 
-def tell_plan(run: Run, count: int, cost: Cost, tiles: Tiles | None = None) -> None:
+def tell_plan(run: Run, count: int, cost: Cost, plan: TilePlan | None = None) -> None:
     """Print what a command would do that trains `count` Gaussians, and its rough time and memory."""
     run.answer(
         f"{plural(count, 'Gaussian')}, {plural(cost.views, 'target image')} of {cost.pixels:,} pixels, "
         f"{plural(cost.steps, 'step')}: roughly {max(1, cost.seconds):.0f} s on two cores and "
-        f"{cost.bytes / 1e6:,.0f} MB"
+        f"{memory_of(cost)}"
     )
     run.say_dry()
-    run.result({"count": count, **asdict(cost), "seconds": cost.seconds, **tiles_of(tiles)})
+    run.result({"count": count, **asdict(cost), "seconds": cost.seconds, **tiles_of(plan)})
 
 
-def tiles_of(tiles: Tiles | None) -> dict[str, int]:
+def memory_of(cost: Cost) -> str:
+    """Describe the memory of a job, and the disk that tiles take."""
+    disk = f", and {cost.disk / 1e6:,.0f} MB of disk" if cost.disk else ""
+    return f"{cost.bytes / 1e6:,.0f} MB{disk}"
+
+
+def tiles_of(plan: TilePlan | None) -> dict[str, int]:
     """Return the numbers of tiles and workers, for the result of a dry run."""
-    return {} if tiles is None else {"tiles": tiles.plan.tiles, "workers": tiles.plan.workers}
+    return {} if plan is None else {"tiles": plan.tiles, "workers": plan.workers}
 
 
 def counts_line(report: RunReport) -> str:
@@ -85,13 +83,9 @@ def counts_line(report: RunReport) -> str:
     return f"{report.title}, {report.sizes}; {times}"
 
 
-def told(report: RunReport | TiledReport, *, verbose: bool = False) -> list[str]:
+def told(report: RunReport, *, verbose: bool = False) -> list[str]:
     """Return lines on recovery, losses, unseen parts and packing; `verbose` adds idle
     regularisers."""
-    from g2ard.report.run import TiledReport
-
-    if isinstance(report, TiledReport):
-        return [line for line in map(loss, report.kinds) if line]
     from g2ard.jobs.format_loss import score_lines
     from g2ard.stages.recover.report import cut_short, outcome, unregularized
     from g2ard.stages.simplify.gaps import RECOVERED_GAPS, gaps_line

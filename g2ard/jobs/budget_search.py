@@ -6,7 +6,7 @@ import math
 import tempfile
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,6 @@ from g2ard.errors import InputError
 from g2ard.io import write_splats
 from g2ard.io.scene_formats import scene_format, written_bytes
 from g2ard.io.scenes import read_back
-from g2ard.jobs.budget import Budget
 from g2ard.progress import Say, plural, unsaid
 from g2ard.rendering.metrics import psnr, ssim
 from g2ard.rendering.renderer import Renderer
@@ -94,42 +93,30 @@ def _written(splats: Splats, name: str, **options: Any) -> Iterator[Path]:
         yield path
 
 
-def resolved_in_tiles(
-    budget: Budget, total: int, sample: Splats, name: str, file: str, say: Say
-) -> ResolvedBudget:
-    """Resolve a budget for `total` Gaussians in tiles; `needs_whole` rejects those that need to measure them.
-
-    Args:
-        sample: some of them, with the SH degree of the result.
-        file: name of a .ply, in which all Gaussians take as many bytes.
-    """
-    if budget.layers is not None:
-        say(f"note: {budget.fit}: in tiles, Gaussians per pixel of near views are not measured")
-    if budget.bytes is None:
-        return ResolvedBudget(budget.of(total, name))
-    one, two = (file_bytes(sample.take(np.arange(rows)), file) for rows in (1, 2))
-    header = one - (two - one) + len(str(total))
-    count = min(total, (budget.bytes - header) // (two - one))
-    if count < 1:
-        raise InputError(f"{budget.bytes:,} bytes are too few; a Gaussian takes {one:,}", path=file)
-    say(f"{budget.fit}: {plural(count, 'Gaussian')}")
-    return ResolvedBudget(count, budget.bytes, file)
-
-
-def count_for_bytes(splats: Splats, wanted: int, name: str, reduce: Callable[[int], Splats]) -> int:
+def count_for_bytes(
+    splats: Splats, wanted: int, name: str, reduce: Callable[[int], Splats], total: int | None = None
+) -> int:
     """Return approximately the most Gaussians whose file has at most `wanted` bytes.
 
     A sample's bytes per Gaussian give the first count. Files of the scene reduced to trial counts then
     bracket the result, until one fills 98 % of the bytes.
+
+    Args:
+        total: Gaussians of the scene, if `splats` is a sample of it. All of a .ply take as many bytes, so no
+            trial is needed.
     """
-    fewest, most = min(_FEWEST_GAUSSIANS, len(splats)), len(splats)
-    sample = splats.take(np.array(evenly_spaced(most, _PROBE_ROWS, floor=True)))
+    most = total or len(splats)
+    fewest = min(_FEWEST_GAUSSIANS, most)
+    if total is not None and scene_format(name).suffix == ".ply":
+        return _count_of_ply(splats, wanted, name, most)
+    sample = splats.take(np.array(evenly_spaced(len(splats), _PROBE_ROWS, floor=True)))
     count = int(len(sample) * wanted / file_bytes(sample, name))
     fits, over = (0, 0), (most + 1, 0)  # (count, bytes); 0 bytes means no such file yet
     files: list[tuple[int, int]] = []
     while len(files) < _BYTES_PROBES or not fits[0]:
         count = min(max(count, fits[0] + 1, fewest), over[0] - 1, most)
         size = file_bytes(reduce(count) if count < most else splats, name)
+        size = size * most // len(splats) if count == most else size  # of a sample
         files.append((count, size))
         if size <= wanted:
             fits = (count, size)
@@ -152,6 +139,15 @@ def count_for_bytes(splats: Splats, wanted: int, name: str, reduce: Callable[[in
                 near = count + (_BYTES_GOAL * wanted - size) / slope
             count = int(min(max(near, count / 4), 4 * count))
     return fits[0]
+
+
+def _count_of_ply(splats: Splats, wanted: int, name: str, most: int) -> int:
+    one, two = (file_bytes(splats.take(np.arange(rows)), name) for rows in (1, 2))
+    header = one - (two - one) + len(str(most))
+    count = min(most, (wanted - header) // (two - one))
+    if count < 1:
+        raise InputError(f"{wanted:,} bytes are too few; a Gaussian takes {one:,}", path=name)
+    return count
 
 
 def _slope(before: tuple[int, int], after: tuple[int, int]) -> float:
@@ -190,7 +186,11 @@ def quality(renders: list[Any], splats: Splats, cameras: Cameras) -> Quality:
 
 
 def count_for_quality(
-    splats: Splats, wanted: Quality, cameras: Cameras, reduce: Callable[[int], Splats]
+    renders: list[NDArray[Any]],
+    total: int,
+    wanted: Quality,
+    cameras: Cameras,
+    reduce: Callable[[int], Splats],
 ) -> tuple[int, Quality]:
     """Return approximately the fewest Gaussians that keep a quality in these views, and their quality.
 
@@ -201,12 +201,13 @@ def count_for_quality(
     excess is at most 0.25 dB.
 
     Args:
+        renders: images of the scene in these views.
+        total: number of its Gaussians.
         reduce: count → scene, by the method that makes the result.
     """
-    renders = clipped_images(splats, cameras)
-    met, good, missed = len(splats), Quality(float("inf"), 1.0), 0
+    met, good, missed = total, Quality(float("inf"), 1.0), 0
     excesses: dict[int, float] = {}
-    count = max(_FEWEST_GAUSSIANS, len(splats) // 4)
+    count = max(_FEWEST_GAUSSIANS, total // 4)
     while len(excesses) < _QUALITY_TRIALS and missed < count < met:
         measured = quality(renders, reduce(count), cameras)
         excesses[count] = excess = measured.over(wanted)
@@ -216,7 +217,7 @@ def count_for_quality(
             missed = count
         if 0 <= excess <= _QUALITY_TOLERANCE or met <= _FEWEST_GAUSSIANS:
             break
-        count = _next_count(excesses, met, missed, len(splats))
+        count = _next_count(excesses, met, missed, total)
     return met, good
 
 
@@ -249,14 +250,16 @@ class ResolvedBudget:
         bytes: largest size of the result's file; None for no limit.
         file: a file name; its suffix is the format.
         wanted: quality to keep; None for no requirement.
+        renders: images of the dense scene in the views `cameras`, and the number of its Gaussians, `total`.
     """
 
     count: int
     bytes: int | None = None
     file: str = "scene.ply"
     wanted: Quality | None = None
-    dense: Splats | None = None
+    renders: list[NDArray[Any]] = field(default_factory=list)
     cameras: Cameras | None = None
+    total: int = 0
 
     def shrink(self, splats: Splats, say: Say = unsaid) -> Splats:
         """Merge the scene further while its file is too large."""
@@ -273,14 +276,13 @@ class ResolvedBudget:
         if self.wanted is None:
             return None
 
-        assert self.dense is not None
         assert self.cameras is not None
-        got = quality(clipped_images(self.dense, self.cameras), as_file(splats, self.file), self.cameras)
+        got = quality(self.renders, as_file(splats, self.file), self.cameras)
         count, views = plural(len(splats), "Gaussian"), plural(len(self.cameras), "view")
         line = f"{count} keep {got} in the {views} that chose the count"
         if got.meets(self.wanted):
             return True, f"{line}; requested: {self.wanted}"
         more = f"request a count above {len(splats):,}"
-        if len(splats) >= len(self.dense):
+        if len(splats) >= self.total:
             more = f"{scene_format(self.file).suffix} cannot store more quality"
         return False, f"{line}, less than the requested {self.wanted}; {more}"

@@ -16,7 +16,7 @@ from g2ard.errors import InputError
 from g2ard.io.sog_write import palette_size
 from g2ard.io.tile_store import row_width
 from g2ard.jobs.distill_options import LEAST_RECOVERY_SHARE
-from g2ard.jobs.memory import RECOVERY_TIMES, TileMemory, amount
+from g2ard.jobs.memory import RECOVERY_TIMES, TileMemory, TilePlan, amount
 from g2ard.jobs.run_views import within_pixels
 from g2ard.progress import plural
 from g2ard.rendering.targets import CACHE_BYTES
@@ -46,10 +46,10 @@ _TILED = {
 """Microseconds per Gaussian of stages in tiles, in order: half to two thirds of the CPU time of guitar and
 150,000 Gaussians of playbot in tiles of 30,000 and 50,000. In larger tiles, 1 to 100 million Gaussians take
 5 to 7 in all (`docs/benchmarks.md`)."""
-_LIGHT, _TILED_TIMES, _SEEN_TILES = 0.0025, 1.2, 4
-"""Seconds per view of `light`; time of a step in a tile relative to one in one piece, as surroundings are
-drawn too (0.6 on guitar and 2.1 on playbot, in four tiles by two workers); and the most tiles that a view is
-expected to see, each of which takes steps."""
+_LIGHT = 0.0025
+"""Seconds per view of `light`."""
+_IMAGE_FILE_BYTES = 6
+"""Bytes per pixel of a render of a scene in tiles in its file."""
 
 LARGEST_DENSE = 250_000
 """Largest dense scene that view.html shows beside the result: it adds at most 8 MB of SOG at SH degree 2."""
@@ -69,7 +69,7 @@ _PACKED_BYTES, _PALETTE_BYTES = 200, 1_300
 """Bytes of packing the viewer page: per Gaussian, and per entry of the palette of harmonics, of which there
 are at most 65,536. Measured: 22 and 39 MB for 20,000 Gaussians of SH degree 1 and 3, 97 for 150,000 of degree
 2, 118 for 250,000 of degree 3."""
-_TRAINER_BYTES = 983
+TRAINER_BYTES = 983
 """Bytes per Gaussian in recovery: parameters, Adam's moments, buffers (`docs/benchmarks.md`)."""
 
 
@@ -83,6 +83,7 @@ class Cost:
         steps: of all recoveries.
         stages: stages to come, in order, with their seconds on two cores.
         bytes: peak memory.
+        disk: bytes of files of a scene in tiles, until the result is written.
     """
 
     views: int
@@ -90,6 +91,7 @@ class Cost:
     steps: int
     stages: tuple[tuple[str, float], ...]
     bytes: int
+    disk: int = 0
 
     @property
     def seconds(self) -> float:
@@ -101,7 +103,7 @@ def cost_of(job: Any, count: int, *, page: bool = True) -> Cost:
     """Return the cost of distilling a prepared job's scene to `count` Gaussians.
 
     Args:
-        job: a `DistillJob` or `TiledJob`; their modules use this one.
+        job: a `DistillJob`; its module uses this one.
         page: whether pages with the result are written.
     """
     train, test = job.views.train.cameras, job.views.test
@@ -109,23 +111,14 @@ def cost_of(job: Any, count: int, *, page: bool = True) -> Cost:
     pixels = _mean_pixels(train)
     kept, size = job.is_kept(count), pixels / _USUAL_PIXELS
     views = len(test) + apart + (len(train) if job.recovers else 0)
-    tiles = 1 if job.tiles is None else job.tiles.plan.tiles
-    step = _each(_STEP, size, count / tiles)
+    step = _each(_STEP, size, count)
     steps = 0 if kept or not job.recovers else job.steps(count)
     steps, recovery = _within(job.config.recover.recovery_time, steps, step)
-    if job.tiles is not None:
-        seen = min(tiles, _SEEN_TILES)
-        render = _each(_RENDER, size, job.tiles.plan.count * seen / tiles)
-        stages = _tiled_stages(job.tiles, len(train), gaps=not job.recovers)
-        stages.append(("light", _LIGHT * views))
-        times, drawn = _TILED_TIMES * seen, 2 * render * views
-        stages.append(("recover", times * recovery + drawn) if job.recovers else ("score", drawn))
-        return Cost(views, pixels, steps, tuple(stages), job.tiles.plan.bytes)
-    target = _each(_RENDER, size, 0 if job.teacher is None else len(job.prior))
+    target = _each(_RENDER, size, job.total if job.renders else 0)
     twice = 4 * len(job.views.twice or ())
     stages = [("targets", target * (views if steps else len(test) + apart))]
     if not kept:
-        stages += [("visibility", _VISIBILITY * len(train)), ("simplify", _SIMPLIFY * len(job.prior))]
+        stages += _merging_stages(job.plan, job.total, len(train), gaps=not job.recovers)
     scored = len(test) + apart // 2 + twice  # the others validate
     after = [("scoring", _each(_SCORE, size, count) * scored + target * twice)]
     after += [("report.html", _REPORT), ("view.html", _PAGE)] if page else []
@@ -136,7 +129,15 @@ def cost_of(job: Any, count: int, *, page: bool = True) -> Cost:
             steps, recovery = _within(left, steps, step)
         stages.append(("recover", recovery))
     stages += after
-    return Cost(views, pixels, steps, tuple(stages), _peak_bytes(job, count, steps, page))
+    disk = 0 if job.plan is None else job.plan.disk
+    disk += _IMAGE_FILE_BYTES * pixels * views if disk and job.renders else 0
+    return Cost(views, pixels, steps, tuple(stages), _peak_bytes(job, count, steps, page), disk)
+
+
+def _merging_stages(plan: TilePlan | None, total: int, views: int, *, gaps: bool) -> list[tuple[str, float]]:
+    if plan is not None:
+        return _tiled_stages(plan, views, gaps=gaps)
+    return [("visibility", _VISIBILITY * views), ("simplify", _SIMPLIFY * total)]
 
 
 def _within(limit: float | None, steps: int, step: float) -> tuple[int, float]:
@@ -178,7 +179,7 @@ def cost_of_recovery(
         )
     dense = 0 if teacher is None else int(_KEPT_TIMES * teacher.nbytes)
     memory = _PROGRAM_BYTES + _target_bytes(used, teacher) + _image_bytes(used)
-    memory += dense + int(_KEPT_TIMES * scene.nbytes) + _TRAINER_BYTES * len(scene)
+    memory += dense + int(_KEPT_TIMES * scene.nbytes) + TRAINER_BYTES * len(scene)
     return Cost(views, pixels, steps, tuple(stages), memory)
 
 
@@ -199,28 +200,26 @@ def _pixels(cameras: Cameras) -> NDArray[np.int64]:
 def cost_of_reduction(reduce: Reduction, count: int) -> Cost:
     """Return the cost of simplifying a scene to `count` Gaussians; its views measure visibility."""
     seen = reduce.seen if count < reduce.total else None
-    views, pixels = 0 if seen is None else len(seen), 0
-    if reduce.tiles is not None:
-        stages = _tiled_stages(reduce.tiles, views, gaps=True)
-        return Cost(views, pixels, 0, tuple(stages), reduce.tiles.plan.bytes)
-    stages = [("visibility", _VISIBILITY * views), ("simplify", _SIMPLIFY * reduce.total)]
-    memory = _PROGRAM_BYTES + int(_SCENE_TIMES * reduce.splats.nbytes)
+    views, pixels, plan = 0 if seen is None else len(seen), 0, reduce.plan
+    stages = _merging_stages(plan, reduce.total, views, gaps=True)
+    if plan is not None:
+        return Cost(views, pixels, 0, tuple(stages), plan.bytes, plan.disk)
+    memory = _PROGRAM_BYTES + int(_SCENE_TIMES * reduce.dense.sample.nbytes)
     memory += _sampled(_SURVEY, reduce.total) if views else 0
     return Cost(views, pixels, 0, tuple(stages), memory)
 
 
-def _tiled_stages(tiles: Any, views: int, *, gaps: bool) -> list[tuple[str, float]]:
+def _tiled_stages(plan: TilePlan, views: int, *, gaps: bool) -> list[tuple[str, float]]:
     """Return the stages of a simplification in tiles by some views, if any.
 
     Args:
         gaps: whether the opacity lost is measured.
     """
-    over = {"tiles": tiles.store, "coarse": tiles.workers, "gaps": None if gaps and views else 0}
-    done = [name for name, value in over.items() if value is not None]
+    done = ["tiles", "coarse"] if plan.written else []
+    done += [] if gaps and views else ["gaps"]
     done += [] if views else ["light", "visibility", "merged visibility"]
-    count = tiles.plan.count
     return [
-        (name, _LIGHT * views + micro * 1e-6 * count if name == "light" else micro * 1e-6 * count)
+        (name, _LIGHT * views + micro * 1e-6 * plan.count if name == "light" else micro * 1e-6 * plan.count)
         for name, micro in _TILED.items()
         if name not in done
     ]
@@ -231,17 +230,19 @@ def _peak_bytes(job: Any, count: int, steps: int, page: bool) -> int:
     given, views, train = job.config.recover.sh_degree, job.views, job.views.train.cameras
     degree = job.prior.sh_degree if given is None else given
     dense, scene, small = len(job.prior), job.prior.nbytes, 4 * row_width(degree) * count
+    rows = 0 if job.plan else dense  # that view.html may show
     chosen = job.config.select.count_of(len(train))
     used = [train if chosen == "auto" else train.take(range(min(chosen, len(train))))] if steps else []
     used += [part for part in (views.test, views.apart) if part is not None]
     full = [] if views.full is None else [within_pixels(views.full)]
-    targets = sum(_target_bytes(part, job.teacher) for part in (used, full))
+    targets = sum(_target_bytes(part, job.prior if job.renders else None) for part in (used, full))
     kept = _PROGRAM_BYTES + _sampled(_SURVEY, dense) + targets + _image_bytes([*used, *full]) + 2 * small
     packing = _packing_bytes(count, degree)
-    if count < dense <= LARGEST_DENSE:  # shown beside the result
+    if count < rows <= LARGEST_DENSE:  # shown beside the result
         packing = max(packing, _packing_bytes(dense, job.prior.sh_degree))
     written = _KEPT_TIMES * scene + max(_sampled(_LOOKS, dense), packing if page else 0)
-    return kept + int(max(_SCENE_TIMES * scene, scene + _TRAINER_BYTES * count, written))
+    held = kept + int(max(_SCENE_TIMES * scene, scene + TRAINER_BYTES * count, written))
+    return held if job.plan is None else max(held, job.plan.bytes)
 
 
 def _target_bytes(views: Sequence[Cameras], teacher: Splats | None) -> int:
@@ -269,13 +270,16 @@ def _packing_bytes(count: int, degree: int) -> int:
 
 
 def check_job_memory(job: Any, most: int | None, need: int) -> None:
-    """Reject a job in one piece that needs more than `most` bytes; None means no limit."""
-    if most is None or need <= most or job.tiles is not None:
+    """Reject a job that needs more than `most` bytes; None means no limit."""
+    if most is None or need <= most:
         return
-    count = len(job.prior)
+    count = job.total
     message = f"--memory: {plural(count, 'Gaussian')} in one piece take about {amount(need, ceil=True)}, "
+    if job.plan is not None:
+        message = f"--memory: recovering {plural(job.budget.count, 'Gaussian')} takes about "
+        message += f"{amount(need, ceil=True)}, "
     message += f"more than {amount(most)}; smaller views, --size, take less"
-    if job.teacher is not None and not job.lifted:  # tiles support this job
+    if job.plan is None and job.renders:  # tiles support this job
         tiles = TileMemory(count, 4 * row_width(job.prior.sh_degree), RECOVERY_TIMES)
         message += f"; in tiles {tiles.advice(most, max(1, count // 2))}"
     raise InputError(message)

@@ -26,20 +26,22 @@ from g2ard.jobs.clean import clean as remove_clutter
 from g2ard.jobs.distill_options import LEAST_RECOVERY_SHARE, DistillOptions
 from g2ard.jobs.doubts import doubts_of_regions, doubts_of_views
 from g2ard.jobs.inputs import GivenViews, Views, axes_of, load_scene, make_targets, scorable, split_views
-from g2ard.jobs.memory import RECOVERY_TIMES
+from g2ard.jobs.memory import RECOVERY_TIMES, TilePlan
 from g2ard.jobs.photo_colors import colored
 from g2ard.jobs.photo_points import distinct, sparse_file, sparse_points, topped_up, usual_count
-from g2ard.jobs.run_views import Use, views_of, within_pixels
+from g2ard.jobs.run_views import Use, pool_times, views_of, within_pixels
 from g2ard.jobs.simplify import Reduction
 from g2ard.jobs.view_checks import check_photos, propose_background
 from g2ard.jobs.viewer_frame import best_level
 from g2ard.pipeline.config import DistillConfig
+from g2ard.pipeline.dense import Dense, InMemory
 from g2ard.pipeline.distill import Distilled, RunViews
 from g2ard.pipeline.distill import distill as pipeline
 from g2ard.poses import best_views
 from g2ard.progress import Detail, Progress, Say, plural, silent, unsaid
-from g2ard.rendering.targets import Subset, Targets, TeacherRenders, fill, kinds_of, kinds_told
-from g2ard.rendering.visibility import overdraw, visibility_source
+from g2ard.rendering.metrics import psnr
+from g2ard.rendering.targets import Subset, Targets, fill, kinds_of, kinds_told
+from g2ard.rendering.visibility import overdraw
 from g2ard.report.run import Packed, RunReport, by_kind
 from g2ard.scene.cameras import USUAL, Cameras
 from g2ard.scene.samples import evenly_spaced
@@ -47,13 +49,13 @@ from g2ard.scene.splats import Splats
 from g2ard.stages.evaluate import Evaluation, evaluate
 from g2ard.stages.lift import in_axes, lift, lift_rows
 from g2ard.stages.recover.anchors import FREE, PriorMeasures, Regularizers, measure_prior, regularizers_for
-from g2ard.stages.recover.config import Schedule
-from g2ard.stages.simplify import simplify
-from g2ard.stages.simplify.gaps import opacity_lost, say_gaps
+from g2ard.stages.recover.config import RecoverConfig, Schedule
+from g2ard.stages.simplify.gaps import say_gaps
 from g2ard.system.cached import cached_property
+from g2ard.system.peak_memory import peak_rss_of_all
 
 if TYPE_CHECKING:
-    from g2ard.jobs.in_tiles import TiledJob
+    from g2ard.jobs.dense import Opened
     from g2ard.jobs.tile_options import Tiling
 
 
@@ -83,22 +85,23 @@ class DistillJob:
     """A prepared distillation: everything is decided, nothing rendered yet.
 
     Args:
-        prior: the dense scene, or a lifted point cloud.
+        dense: the dense scene, or a lifted point cloud.
         budget: the resolved budget.
-        teacher: the scene rendered for targets; None if all targets are photos.
-        photos_over_renders: use photos where views have them and renders for the rest; always False without a
-            teacher.
+        renders: whether renders of the dense scene are targets; otherwise all are photos.
+        photos_over_renders: use photos where views have them and renders for the rest; always False without
+            renders.
         preset: the regularisers chosen, and why.
         recovers: whether the scene is recovered, or only merged.
         cleaned: number of Gaussians removed by kind of clutter; None without cleaning.
         began, prepared: when the preparation began and ended.
         time: limit of the whole run in seconds; None without one.
+        plan: of the dense scene's tiles; None if it is in memory.
     """
 
-    prior: Splats
+    dense: Dense
     budget: ResolvedBudget
     views: RunViews
-    teacher: Splats | None
+    renders: bool
     photos_over_renders: bool
     config: DistillConfig
     lifted: bool
@@ -111,22 +114,22 @@ class DistillJob:
     time: float | None = None
     progress: Progress = silent
     say: Say = unsaid
-    tiles = None
+    plan: TilePlan | None = None
 
     @property
-    def dense(self) -> Splats:
-        """The dense scene."""
-        return self.prior
+    def prior(self) -> Splats:
+        """The dense scene, or a sample of one in tiles."""
+        return self.dense.sample
 
     @property
     def total(self) -> int:
         """Gaussians of the dense scene."""
-        return len(self.prior)
+        return self.dense.total
 
     @property
     def reads_photos(self) -> bool:
         """Whether any target may be a photo."""
-        return self.teacher is None or self.photos_over_renders
+        return not self.renders or self.photos_over_renders
 
     @property
     def photos(self) -> list[Path]:
@@ -145,7 +148,7 @@ class DistillJob:
         degree = self.config.recover.sh_degree
         return (
             not self.reads_photos
-            and count == len(self.prior)
+            and count == self.total
             and (degree is None or degree >= self.prior.sh_degree)
             and self.config.recover.schedule.guarded
         )
@@ -153,12 +156,18 @@ class DistillJob:
     def steps(self, count: int) -> int:
         """Return the steps of all recoveries: after each round, if there are rounds, and of the last."""
         recover, simplify = self.config.recover, self.config.simplify
-        like = self.prior.take(np.array(evenly_spaced(len(self.prior), count)))
+        like = self.prior.take(np.array(evenly_spaced(len(self.prior), min(count, len(self.prior)))))
         last = recover.final_steps(like, self.views.train.cameras, of_photos=self.reads_photos)
         if not recover.schedule.round_steps:
             return last
-        rounds = simplify.rounds(len(self.prior), count, recovered=True)
+        rounds = simplify.rounds(self.total, count, recovered=True)
         return last + len(rounds) * recover.schedule.round_steps
+
+    @property
+    def render(self) -> Callable[[Cameras], Targets] | None:
+        """Function that renders the dense scene for targets, if any are renders."""
+        background = self.config.recover.background
+        return partial(self.dense.images, background=background) if self.renders else None
 
     @cached_property
     def targets(self) -> RunTargets:
@@ -167,33 +176,33 @@ class DistillJob:
 
         def made(cameras: Cameras, say: Say = unsaid) -> Targets:
             background, mixed = self.config.recover.background, self.photos_over_renders
-            return make_targets(cameras, self.teacher, background, mixed=mixed, say=say)
+            return make_targets(cameras, self.render, background, mixed=mixed, say=say)
 
         train, held_out = made(views.train.cameras, say), scorable(made(views.test, say), say)
         validation = apart = None
-        if self.teacher is not None and views.apart is not None and len(views.apart) > 1:
+        if self.renders and views.apart is not None and len(views.apart) > 1:
             validation, apart = (made(views.apart.take(range(i, len(views.apart), 2))) for i in (0, 1))
         full = None if views.full is None else scorable(made(within_pixels(views.full)))
-        twice = None if views.twice is None or self.teacher is None else made(views.twice)
+        twice = None if views.twice is None or not self.renders else made(views.twice)
         return RunTargets(train, held_out, validation, apart, full, twice)
 
     def best(self, done: Distilled) -> Targets:
         """Return targets of the views that show the result best: placed ones, or some of the scored ones."""
         held_out = self.targets.held_out
         cameras, pool = held_out.cameras, self.views.pool
-        if self.teacher is None or pool is None:
+        if not self.renders or pool is None:
             names = best_views(done.splats, _SHOWN, cameras).names
             return done.scored_on(Subset(held_out, [cameras.names.index(name) for name in names]))
         found = best_level(self.prior, _SHOWN, pool.cameras)
         longest = int(np.maximum(cameras.widths, cameras.heights).max())
-        return TeacherRenders(self.teacher, found.scaled(longest), background=self.config.recover.background)
+        return self.dense.images(found.scaled(longest), self.config.recover.background)
 
     def run(self, work: Path | None = None) -> Distilled:
         """Distil the scene; `work` is the folder for resuming, see `g2ard.pipeline.distill`."""
         for scored in filter(None, (self.targets.held_out, self.targets.apart)):
             fill(scored, self.progress)
         limited = None if self.time is None else partial(self.time_left, self.time)
-        done = self._reduced(self.prior, self.budget.count, work, time_left=limited)
+        done = self._reduced(self.dense, self.budget.count, work, time_left=limited)
         splats = self.budget.shrink(done.splats, self.say)
         return replace(done, splats=splats, held_out=done.scored_on(self.targets.held_out))
 
@@ -219,7 +228,7 @@ class DistillJob:
 
     def _reduced(
         self,
-        scene: Splats,
+        scene: Dense,
         count: int,
         work: Path | None,
         time_left: Callable[[], float] | None = None,
@@ -238,27 +247,42 @@ class DistillJob:
         )
 
     def level(
-        self, finer: Splats, count: int, views: RunViews, work: Path | None = None
-    ) -> tuple[Splats, Splats, float, float | None]:
+        self, finer: Dense, count: int, views: RunViews, work: Path | None = None
+    ) -> tuple[Dense, Dense, float, float | None]:
         """Make a level of detail, see `g2ard.jobs.levels.LevelsJob`."""
         job = replace(self, views=replace(views, full=None))
         held_out = job.targets.held_out
         fill(held_out, self.progress)
+        if self.recovers and self._fits(count):
+            done = job._reduced(finer, count, work)
+            lost = self.dense.opacity_lost(done.splats, held_out.cameras)
+            say_gaps(lost, self.say, f"give levels more Gaussians (--ratios), here {count:,}")
+            on = done.scored_on(held_out)
+            level, merged = InMemory(done.splats), InMemory(done.simplified)
+            return level, merged, job._score(merged, on), job._score(level, on)
+        if self.recovers:
+            self.say(f"{plural(count, 'Gaussian')} are too many for the memory to recover: merged only")
+        cameras, config = self.views.train.cameras, self.config.simplify
+        small = finer.merged(count, cameras, config, gaps=True, progress=self.progress)
+        say_gaps(small.report.opacity_lost, self.say)
+        derived = finer.derived(small.splats, "merged")
+        return derived, derived, job._score(derived, held_out), None
 
-        def score(splats: Splats, on: Targets = held_out) -> float:
-            colour = self.config.recover.background
-            return evaluate(splats, on, stage="scoring", background=colour, progress=self.progress).psnr
+    def _fits(self, count: int) -> bool:
+        """Return whether memory holds the recovery of a level."""
+        from g2ard.jobs.cost import TRAINER_BYTES
 
-        if not self.recovers:
-            visibility = visibility_source(self.views.train.cameras, progress=self.progress)
-            merged = simplify(finer, count, visibility=visibility, gaps=True, progress=self.progress)
-            say_gaps(merged.report.opacity_lost, self.say)
-            return merged.splats, merged.splats, score(merged.splats), None
-        done = job._reduced(finer, count, work)
-        lost = opacity_lost(self.prior, done.splats, held_out.cameras)
-        say_gaps(lost, self.say, f"give levels more Gaussians (--ratios), here {count:,}")
-        on = done.scored_on(held_out)
-        return done.splats, done.simplified, score(done.simplified, on), score(done.splats, on)
+        return self.plan is None or TRAINER_BYTES * count <= self.plan.memory
+
+    def _score(self, scene: Dense, on: Targets) -> float:
+        """Return the mean PSNR of a level in some views."""
+        background = self.config.recover.background
+        if isinstance(scene, InMemory):
+            return evaluate(
+                scene.splats, on, stage="scoring", background=background, progress=self.progress
+            ).psnr
+        drawn = scene.images(on.cameras, background)
+        return float(np.mean([psnr(drawn[view], on[view]) for view in range(len(on.cameras))]))
 
     def report(self, done: Distilled, file: Path) -> RunReport:
         """Score the simplified and the recovered scene in held-out views, and describe the run.
@@ -291,12 +315,12 @@ class DistillJob:
             packed = Packed(file.name, found.psnr, found.ssim)
         self.progress("gaps", 0, 0)
         return RunReport(
-            input_count=len(self.prior),
+            input_count=self.total,
             output_count=len(done.splats),
             lifted=self.lifted,
             photos=len(self.views.train.cameras) if from_points else None,
             cleaned=self.cleaned,
-            bytes={"input": self.prior.nbytes, "output": done.splats.nbytes, "file": file.stat().st_size},
+            bytes={"input": self._dense_bytes, "output": done.splats.nbytes, "file": file.stat().st_size},
             scores=scores,
             apart=apart,
             size=cameras.size_text,
@@ -304,7 +328,7 @@ class DistillJob:
             kinds=by_kind(before, after, USUAL if made else "given"),
             unseen=self._unseen(done),
             warnings=self._warnings(done),
-            opacity_lost=None if from_points else opacity_lost(self.prior, done.splats, cameras),
+            opacity_lost=None if from_points else self.dense.opacity_lost(done.splats, cameras),
             overdraw=overdraw(done.splats, cameras, self.progress),
             against=kinds_of(targets.held_out),
             preset=self.preset,
@@ -314,7 +338,13 @@ class DistillJob:
             settings=listed(config),
             seconds=self._seconds(done.report.seconds.as_dict()),
             packed=packed,
+            tiles=None if self.plan is None else self.plan.tiles,
+            peak_rss_bytes=None if self.plan is None else peak_rss_of_all(),
         )
+
+    @property
+    def _dense_bytes(self) -> int:
+        return self.prior.nbytes * self.total // len(self.prior)
 
     def _seconds(self, stages: dict[str, float]) -> dict[str, float]:
         """Return the seconds by stage, with the scores as the rest until now, and their total."""
@@ -341,11 +371,13 @@ class DistillJob:
         if self.views.unseen is not None:
             return self.views.unseen
         unseen = done.report.rounds[0].simplify.unseen
-        return None if unseen is None else unseen / len(self.prior)
+        return None if unseen is None else unseen / self.total
 
 
 Given = Splats | Points | Source | None
 """Input of a distillation; None starts from photos alone."""
+
+_NO_PHOTOS = "no photos: the lifted points render the training images; photos, given as views, show more"
 
 _SHOWN = 3
 """Views in pictures of a run."""
@@ -500,33 +532,38 @@ def preparing(
     planned: bool = False,
     progress: Progress = silent,
     say: Say = unsaid,
-) -> Iterator[DistillJob | TiledJob]:
-    """Prepare a distillation in one piece, or in tiles.
+) -> Iterator[DistillJob]:
+    """Prepare a distillation of a scene in memory, or in tiles.
 
     Args:
-        tiling: how to process the scene, a file, in tiles; None for one piece.
+        tiling: how to process the scene, a file, in tiles; None reads it into memory.
         planned: whether tiles are only planned: the job has a cost, but cannot run.
     """
     callbacks: dict[str, Any] = {"progress": progress, "say": say}
-    if tiling is None or budget is None:
+    if tiling is None:
         yield prepare(scene, budget, options, use=use, **callbacks)
         return
-    from g2ard.jobs.in_tiles import opened, prepare_tiles
+    from g2ard.jobs.dense import opened
 
     assert isinstance(scene, Source)
     began = time.monotonic()
-    options.check_trained()
-    source = scene.drawn_as(options.render_model)
-    with opened(source, tiling, RECOVERY_TIMES, planned=planned, **callbacks) as tiles:
-        yield prepare_tiles(tiles, budget, options, recovers=use != "merging", began=began, **callbacks)
+    if scene.kind == "splats":
+        options.check_trained()
+    config, source = options.config, scene.drawn_as(options.render_model)
+    with opened(
+        source, tiling, RECOVERY_TIMES, config.simplify, config.lift, planned=planned, **callbacks
+    ) as tiles:
+        yield prepare(scene, budget, options, tiles, use=use, began=began, **callbacks)
 
 
 def prepare(
     scene: Given,
     budget: Budget | None,
     options: DistillOptions,
+    tiles: Opened | None = None,
     *,
     use: Use = "distil",
+    began: float | None = None,
     progress: Progress = silent,
     say: Say = unsaid,
 ) -> DistillJob:
@@ -537,25 +574,34 @@ def prepare(
 
     Args:
         budget: None chooses a count for photos alone.
+        tiles: the scene, if it is in tiles.
+        began: when the preparation began; None means now.
     """
-    began, recovers = time.monotonic(), use != "merging"
+    began, recovers = began or time.monotonic(), use != "merging"
     recover = options.config.recover  # rejects invalid settings before anything is read
-    if not isinstance(scene, Splats):
+    if tiles is None and not isinstance(scene, Splats):
         progress("read", 0, 0)
-    read = _read(scene, budget, options, progress, say)
+    if tiles is None:
+        read = _read(scene, budget, options, progress, say)
+    else:
+        read = _in_tiles(scene, options, tiles, say)
+    if read.cloud and not read.needs_photos:
+        say(_NO_PHOTOS)
     budget = budget or Budget(count=read.usual)
-    prior, cleaned = read.prior, None
+    dense, cleaned = read.dense, None
     if options.clean:
-        done = remove_clutter(prior, seed=recover.seed, progress=progress, say=say)
-        prior, cleaned = done.splats, done.clutter.counts
+        done = remove_clutter(dense.sample, seed=recover.seed, progress=progress, say=say)
+        dense, cleaned = InMemory(done.splats), done.clutter.counts
+    prior, total = dense.sample, dense.total
     default_degree = 3 if read.needs_photos else None  # points have one colour each, photos show more
     degree = options.configured(sh_degree=default_degree).recover.sh_degree
-    usual = max(1, len(prior) // _USUAL_RATIO)
+    usual = max(1, total // _USUAL_RATIO)
     views = views_of(
         prior,
         options,
-        usual if budget.is_measured else budget.of(len(prior), read.name),
+        usual if budget.is_measured else budget.of(total, read.name),
         given=read.views,
+        represents=total / len(prior),
         beside=read.beside,
         teach=not read.needs_photos and options.photos is not True,
         use=use,
@@ -564,12 +610,13 @@ def prepare(
     )
     cameras = views.train.cameras
     reduce = Reduction(
-        prior,
+        dense,
         cameras=cameras,
         blind=options.config.simplify.method == "paper",
         given=GivenViews(seed=recover.seed),
         config=options.config.simplify,
         recovered=recovers,
+        plan=None if tiles is None else tiles.plan,
         progress=progress,
         say=say,
     )
@@ -581,14 +628,16 @@ def prepare(
         given = options.named("recover.background") is not None
         propose_background(cameras, recover.background, given, say)
         if read.given:
-            shown = read.prior.take(np.arange(read.given)) if read.needs_photos else prior
+            shown = prior
+            if read.needs_photos and tiles is None:
+                shown = read.dense.sample.take(np.arange(read.given))
             insisted, renders_too = options.photos is True, not read.needs_photos
             check_photos(shown, cameras, recover.background, say, insisted=insisted, renders=renders_too)
-    source = plural(len(prior), "point") if read.cloud else f"{len(prior):,}"
+    source = plural(total, "point") if read.cloud else f"{total:,}"
     say(_task(source, wanted.count, cameras if recovers else None, photos, alone=read.from_photos))
-    if not read.from_photos and wanted.count == len(prior):
+    if not read.from_photos and wanted.count == total:
         one = "point" if read.cloud else "Gaussian"
-        say(f"nothing to simplify: the scene has {plural(len(prior), one)}")
+        say(f"nothing to simplify: the scene has {plural(total, one)}")
     if recovers:
         say(Detail(f"regularisers: {preset_label}"))
     config = options.configured(regularizers, default_degree)
@@ -598,11 +647,13 @@ def prepare(
         if not asked and options.named("recover.schedule.finest") is None:
             schedule = replace(schedule, finest=0.0)
         config = replace(config, recover=replace(config.recover, schedule=schedule, from_points=True))
+    else:
+        config = replace(config, recover=_grown(config.recover, dense, cameras, of_photos=not renders))
     return DistillJob(
-        prior=prior,
+        dense=dense,
         budget=wanted,
         views=replace(views, apart=None) if photos else views,  # photos exist only for given poses
-        teacher=prior if renders else None,
+        renders=renders,
         photos_over_renders=photos and renders,
         config=config,
         lifted=read.cloud,
@@ -615,7 +666,17 @@ def prepare(
         time=options.time,
         progress=progress,
         say=say,
+        plan=None if tiles is None else tiles.plan,
     )
+
+
+def _grown(recover: RecoverConfig, dense: Dense, cameras: Cameras, *, of_photos: bool) -> RecoverConfig:
+    """Return the settings with more steps for a large scene, whose pool of views grows with it."""
+    times = pool_times(dense.total)
+    if recover.steps is not None or recover.recovery_time is not None or of_photos or times == 1:
+        return recover
+    needed = recover.final_steps(dense.sample, cameras, of_photos=of_photos)
+    return replace(recover, steps=round(needed * times))
 
 
 def _sources(views: RunViews, photos: bool | None, lifted: bool) -> tuple[bool, bool]:
@@ -675,6 +736,7 @@ class _Read:
     """The dense scene as read or lifted.
 
     Args:
+        dense: the scene.
         cloud: whether it was lifted from a point cloud.
         needs_photos: whether only photos can be its targets, as for points that go with photos.
         given: number of Gaussians, the first ones, from points that were not found in the photos.
@@ -683,7 +745,7 @@ class _Read:
         views: the views to learn from and those to score, if the points needed them, see `split_views`.
     """
 
-    prior: Splats
+    dense: Dense
     cloud: bool
     needs_photos: bool
     beside: str | Path | None
@@ -700,22 +762,21 @@ def _read(
     """Read the dense scene, or lift points; with photos they are topped up to the budget."""
     if isinstance(scene, Splats):
         options.check_trained()
-        return _Read(scene.narrowed(), False, False, options.beside, "scene", len(scene))
+        return _Read(InMemory(scene.narrowed()), False, False, options.beside, "scene", len(scene))
     if isinstance(scene, Source) and scene.kind == "splats":
         options.check_trained()
         splats = load_scene(scene.drawn_as(options.render_model), say)
-        return _Read(splats, False, False, options.beside or scene.path, str(scene), len(splats))
+        return _Read(InMemory(splats), False, False, options.beside or scene.path, str(scene), len(splats))
     views, recover = options.views, options.config.recover
-    if views is None or is_made(views):
+    if views is None or is_made(views) or (options.photos is False and scene is not None):
         if scene is None:
             raise InputError("missing; without a scene, pass photos with poses as views", parameter="scene")
         cloud, name, _ = _points(scene, None, say)
         assert cloud is not None
-        say("no photos: the lifted points render the training images; photos, given as views, show more")
         xyz, rgb = cloud.points.positions, cloud.points.colors
         axes = axes_of(cloud, name, say)
         lifted = lift(xyz, rgb, axes=axes, **vars(options.config.lift), progress=progress)
-        return _Read(lifted, True, False, options.beside, name, len(lifted))
+        return _Read(InMemory(lifted), True, False, options.beside, name, len(lifted))
     cloud, name, of_photos = _points(scene, views, say)
     points: Points | None = None
     parts = split_views(views, options.held_out, say)
@@ -750,7 +811,23 @@ def _read(
     config = options.config.lift
     lifted, _ = lift_rows(points.positions, points.colors, config, progress, merge=False)
     lifted = in_axes(lifted, (cloud and cloud.axes) or "RDF")
-    return _Read(lifted, True, True, options.beside, name, given, of_photos, usual, parts)
+    return _Read(InMemory(lifted), True, True, options.beside, name, given, of_photos, usual, parts)
+
+
+def _in_tiles(scene: Given, options: DistillOptions, tiles: Opened, say: Say) -> _Read:
+    """Describe a scene in tiles, or the lift of a point cloud."""
+    assert isinstance(scene, Source)
+    cloud = scene.kind == "points"
+    views = None if is_made(options.views) or options.photos is False else options.views
+    return _Read(
+        tiles.dense,
+        cloud,
+        cloud and views is not None,
+        options.beside or (None if cloud else scene.path),
+        str(scene),
+        len(tiles.dense.sample),
+        views=split_views(views, options.held_out, say) if cloud and views is not None else None,
+    )
 
 
 def _points(scene: Points | Source | None, views: Views | None, say: Say) -> tuple[Cloud | None, str, bool]:

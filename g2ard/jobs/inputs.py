@@ -189,7 +189,7 @@ def _read(views: Views, say: Say, *, unpictured: bool = False) -> tuple[ViewSet,
 
 def make_targets(
     cameras: Cameras,
-    teacher: Splats | None,
+    teacher: Splats | Callable[[Cameras], Targets] | None,
     background: tuple[float, float, float],
     *,
     mixed: bool = False,
@@ -199,9 +199,14 @@ def make_targets(
     """Return targets, made on access: renders of the teacher, or photos if there is no teacher.
 
     With `mixed` and a teacher, each view's photo is used, or a render if it has none.
+
+    Args:
+        teacher: the scene, or a function that renders it.
     """
     renders: Any = {"settings": settings, "lazy": True}
     if teacher is not None and not mixed:
+        if not isinstance(teacher, Splats):
+            return teacher(cameras)
         return TeacherRenders(teacher, cameras, background=background, **renders)
     exposures = find_exposures(cameras)
     if exposures:

@@ -31,6 +31,7 @@ from g2ard.jobs.viewer_frame import backdrop, frame_of, up_of
 from g2ard.levels.tileset import TILE_OF_SCENE, Georeference, map_system
 from g2ard.levels.tileset import save_tileset as write_tileset
 from g2ard.levels.tree import Cut, Level, aligned
+from g2ard.pipeline.dense import Dense
 from g2ard.progress import Progress, Say, direction, plural, silent, unsaid
 from g2ard.scene.regions import sky_mask
 from g2ard.scene.samples import evenly_spaced
@@ -38,7 +39,6 @@ from g2ard.scene.splats import Splats
 from g2ard.viewer.page import Start, write_globe_page, write_stream_page
 
 if TYPE_CHECKING:
-    from g2ard.jobs.in_tiles import TiledJob
     from g2ard.jobs.tile_options import Tiling
 
 RATIOS = (1.0, 2.0, 4.0, 8.0, 16.0)
@@ -104,7 +104,7 @@ class LevelsJob:
         sky: sky and far background, kept apart; None without.
     """
 
-    job: DistillJob | TiledJob
+    job: DistillJob
     ratios: Sequence[float]
     sky: Splats | None = None
 
@@ -131,15 +131,18 @@ class LevelsJob:
         ]
 
     def run(self, work: Path | None = None) -> Levels[Any]:
-        """Make the levels; `work` is the folder for resuming a scene in one piece.
+        """Make the levels; `work` is the folder for resuming.
 
         Each is merged from the one before as it was merged. The job returns a level, the same before
         recovery, and the PSNR of both, None without recovery.
         """
-        job: Any = self.job
+        job = self.job
+        from g2ard.tiles.dense import InTiles
+
         levels: list[Any] = []
         reports: list[LevelReport] = []
-        finer = scene = job.dense
+        finer: Dense = job.dense
+        scene = finer
         for ratio, count, size in zip(self.ratios, self.counts, self.sizes, strict=True):
             began, level = time.perf_counter(), scene
             scores: list[float | None] = []
@@ -147,7 +150,7 @@ class LevelsJob:
                 level, finer, *scores = job.level(finer, count, job.views.resized(size), work)
             report = LevelReport(count, ratio, size, time.perf_counter() - began, *scores)
             job.say(report.line(len(levels)))
-            levels.append(level)
+            levels.append(level.store if isinstance(level, InTiles) else level.sample)
             reports.append(report)
         return Levels(tuple(levels), tuple(reports), self.sky)
 
@@ -175,7 +178,6 @@ def preparing_levels(
         planned: whether tiles are only planned.
     """
     check_ratios(ratios)
-    check_trained(scene)
     sky = None
     if isinstance(scene, Splats):
         scene = scene.narrowed()  # levels and sky then have one offset
@@ -281,16 +283,6 @@ def lod(
         up=up,
     ) as job:
         return job.run(work)
-
-
-def check_trained(scene: Splats | Source) -> None:
-    """Reject the file of a point cloud, which cannot render training images."""
-    if isinstance(scene, Source) and scene.kind == "points":
-        raise InputError(
-            "a point cloud cannot render training images",
-            path=scene.path,
-            hint="distil it first, then make levels of the result",
-        )
 
 
 def check_ratios(ratios: Sequence[float]) -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from g2ard.errors import InputError, require
 from g2ard.io.source import Source
-from g2ard.io.stream import SceneStream
+from g2ard.io.stream import PointStream, SceneStream
 from g2ard.io.tile_store import TileStore, row_width
 from g2ard.jobs.tile_options import Tiling, cut_into
 
@@ -23,6 +23,12 @@ arrays. Measured: 1.95 GB for 5.5 million of SH 0, 0.98 GB for 1.8 million of SH
 
 RECOVERY_TIMES = 1.5
 """Memory of recovering or scoring a tile, renders included, relative to merging it."""
+
+_LIFTING_TIMES = 1.7
+"""Memory of lifting a tile's points relative to merging it: 550 bytes per point."""
+
+_DISK_COPIES = 2
+"""Copies of a scene on the disk: its tiles with their halos, and the files of tasks."""
 
 _LEAST_ROWS = 1000
 """Rows of the smallest tiles that messages advise."""
@@ -139,18 +145,25 @@ class TilePlan:
         count: Gaussians of the scene.
         tiles: number of tiles; expected, if they are not written yet.
         bytes: peak memory of all processes together.
+        memory: bytes that they may take.
+        written: whether the tiles are written.
+        disk: bytes of the tiles and of the files of their tasks.
     """
 
     count: int
     tiles: int
     workers: int
     bytes: int
+    memory: int
+    written: bool
+    disk: int
 
 
-def plan_tiles(scene: TileStore | SceneStream, tiling: Tiling, times: float = 1.0) -> TilePlan:
+def plan_tiles(scene: TileStore | SceneStream | PointStream, tiling: Tiling, times: float = 1.0) -> TilePlan:
     """Return the tiles of a scene, written or not, and the number of workers that memory and cores allow.
 
     Args:
+        scene: or a point cloud, which is lifted to tiles.
         times: memory of a tile relative to merging it.
     """
     from g2ard.tiles.writer import expected_tiles
@@ -162,10 +175,12 @@ def plan_tiles(scene: TileStore | SceneStream, tiling: Tiling, times: float = 1.
         rows, halo = int(largest.rows), int(largest.halo)
         folder = None if scene.folder.parent == tiling.folder else scene.folder
     else:
+        times = max(times, _LIFTING_TIMES) if isinstance(scene, PointStream) else times
         number, most = expected_tiles(count, tiling.most_rows), tiling.most_rows
         rows = -(-count // number)
         halo = round((_HALO_TIMES - 1) * rows)
-    tiles = TileMemory(count, 4 * row_width(scene.sh_degree), times, folder)
+    row_bytes = 4 * row_width(0 if isinstance(scene, PointStream) else scene.sh_degree)
+    tiles = TileMemory(count, row_bytes, times, folder)
     need = tiles.of(rows + halo)
     fit = memory // need
     if fit > 1:  # several workers are processes beside this one
@@ -182,4 +197,12 @@ def plan_tiles(scene: TileStore | SceneStream, tiling: Tiling, times: float = 1.
             f"{_limit_text(tiling)}; --workers {fit} fit"
         )
     workers = tiling.workers or max(1, min(fit, tiling.usable_cores))
-    return TilePlan(count, number, workers, workers * need + (_TASK_BYTES if workers > 1 else 0))
+    return TilePlan(
+        count,
+        number,
+        workers,
+        workers * need + (_TASK_BYTES if workers > 1 else 0),
+        memory,
+        isinstance(scene, TileStore),
+        _DISK_COPIES * count * row_bytes,
+    )

@@ -40,8 +40,8 @@ from g2ard.stages.simplify import simplify
 
 if TYPE_CHECKING:
     from g2ard.jobs.distill_options import DistillOptions
-Use = Literal["distil", "levels", "tiles", "merging"]
-"""Use of generated views. Levels and tiles are scored in usual views alone; merging has no recovery."""
+Use = Literal["distil", "levels", "merging"]
+"""Use of generated views. Levels are scored in usual views alone; merging has no recovery."""
 
 _SHAPE = (800, 600)
 """Width and height of generated views in pixels, unless another size is requested."""
@@ -68,7 +68,7 @@ _OTHER_KINDS = ("near", "standing", "anywhere")
 _COMPACT_ROWS = 100_000
 """Most Gaussians of the compact scene that the choice is measured on."""
 _POOL_GAUSSIANS = 4_000_000
-"""Size of a tiled scene from which the pool grows in proportion."""
+"""Size of a scene from which the pool grows in proportion."""
 _POOL_SAMPLE = 200_000
 """Gaussians that poses are planned on."""
 
@@ -126,7 +126,7 @@ def views_of(
             held_out = load_view_sets(options.held_out, [for_scores], None, say, unpictured=teach)[0].cameras
         planned = plan(_POOL_VIEWS, grow=_POOL_GROWTH)
         share = 1.0
-        if use not in ("merging", "tiles"):
+        if use != "merging":
             share = pool_share(options.config.recover, prior, planned.cameras)
         return _generated(
             planned,
@@ -259,7 +259,7 @@ def _uses(use: Use, train: int, test: int, apart: int) -> str:
     parts = {
         "train": train,
         "score": test + (half if use == "distil" else 0),
-        "validate": apart if use == "tiles" else apart - half,
+        "validate": apart - half,
     }
     return ", ".join(f"{count} {name}" for name, count in parts.items() if count)
 
@@ -491,18 +491,18 @@ def _planned(
     represents: float = 1.0,
     **options: Any,
 ) -> Pool:
-    """Plan a pool as `plan_pool` does, but larger in proportion to a tiled scene's size."""
+    """Plan a pool as `plan_pool` does, but larger in proportion to a large scene's size."""
     times = _times(prior, represents)
     options |= {"size": given.shape, "up": given.up, "seed": given.seed, "represents": represents}
     return plan_pool(prior, round(count * times), rows=round(rows * times), **options)
 
 
 def _times(prior: Splats, represents: float) -> float:
-    return pool_times(len(prior) * represents) if represents > 1 else 1.0
+    return pool_times(len(prior) * represents)
 
 
 def pool_times(count: float) -> float:
-    """Return the growth factor of the pool for a tiled scene of `count` Gaussians."""
+    """Return the growth factor of the pool for a scene of `count` Gaussians."""
     return max(1.0, count / _POOL_GAUSSIANS)
 
 

@@ -12,7 +12,7 @@ from g2ard.config.checks import check_seed, checks_arguments
 from g2ard.config.choices import FormatName, RenderModel
 from g2ard.errors import InputError
 from g2ard.io import Source
-from g2ard.io.scene_formats import check_positions
+from g2ard.io.scene_formats import check_positions, scene_format
 from g2ard.io.types import Note
 from g2ard.jobs.budget import Budget, count_of
 from g2ard.jobs.budget_search import (
@@ -22,21 +22,21 @@ from g2ard.jobs.budget_search import (
     count_for_bytes,
     count_for_layers,
     count_for_quality,
-    resolved_in_tiles,
 )
 from g2ard.jobs.inputs import GivenViews, Views, axes_of, load_scene, say_regions
+from g2ard.pipeline.dense import Dense, InMemory, whole
 from g2ard.pipeline.presets import configured
 from g2ard.progress import Progress, Say, plural, silent, unsaid
-from g2ard.rendering.visibility import SampledVisibility, visibility_source
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats
 from g2ard.stages.lift import lift
-from g2ard.stages.simplify import Pairs, Simplified, SimplifyConfig, VisibilitySource
+from g2ard.stages.simplify import Pairs, Simplified, SimplifyConfig
 from g2ard.stages.simplify import simplify as merge
 from g2ard.stages.simplify.gaps import say_gaps
 from g2ard.system.cached import cached_property
 
 if TYPE_CHECKING:
+    from g2ard.jobs.memory import TilePlan
     from g2ard.jobs.tile_options import Tiling
 
 _QUALITY_VIEWS, _QUALITY_SIDE = 12, 400
@@ -55,14 +55,15 @@ class Reduction:
     are those of `simplify`.
 
     Args:
+        dense: the scene.
         given: views that give visibility weights.
         cameras: cameras that give them to every method instead.
         recovered: whether the results are recovered afterwards, so that their gaps are not measured.
         notes: notes on the scene's file.
-        tiles: the scene, if it is in tiles; `splats` is then a sample.
+        plan: of the scene's tiles; None if it is in memory.
     """
 
-    splats: Splats
+    dense: Dense
     given: GivenViews = field(default_factory=GivenViews)
     cameras: Cameras | None = None
     blind: bool = False
@@ -72,7 +73,7 @@ class Reduction:
     progress: Progress = silent
     say: Say = unsaid
     _made: dict[int, Any] = field(default_factory=dict)
-    tiles: Any = field(default=None, kw_only=True)
+    plan: TilePlan | None = None
 
     def __post_init__(self) -> None:
         check_seed("seed", self.given.seed)
@@ -86,15 +87,20 @@ class Reduction:
                 raise InputError("has no effect with views", parameter="simplify.pixel_scale")
             if self.config.dilation != Pairs.dilation and self.splats.antialiased:
                 raise InputError("has no effect on antialiased scenes", parameter="simplify.dilation")
-        if self.tiles is None:
+        if self.plan is None:
             say_regions(self.splats, self.config, "the scene", self.say)
         else:
             say_regions(self.splats, self.config, "a sample of the scene", unsaid)
 
     @property
+    def splats(self) -> Splats:
+        """The scene, or a sample of one in tiles."""
+        return self.dense.sample
+
+    @property
     def total(self) -> int:
         """Gaussians of the scene."""
-        return len(self.splats) if self.tiles is None else int(self.tiles.plan.count)
+        return self.dense.total
 
     def __call__(self, count: int) -> Any:
         if count not in self._made:
@@ -103,14 +109,11 @@ class Reduction:
 
     def made(self, count: int) -> Any:
         """Simplify the scene."""
-        if self.tiles is not None:
-            return self.tiles.simplified(count, self.seen if count < self.total else None, self.config)
-        return merge(
-            self.splats,
+        return self.dense.merged(
             count,
-            visibility=self._visibility if count < self.total else None,
+            self.seen if count < self.total else None,
+            self.config,
             gaps=not self.recovered,
-            config=self.config,
             progress=self.progress,
         )
 
@@ -133,7 +136,7 @@ class Reduction:
 
     def warnings(self, small: Splats) -> list[str]:
         """Return warnings about the views, and about regions of a result; none for a scene in tiles."""
-        if self.tiles is not None or len(small) >= self.total:
+        if self.plan is not None or len(small) >= self.total:
             return []
         from g2ard.jobs.doubts import doubt_of_distances, doubts_of_regions, doubts_of_views  # as above
 
@@ -142,13 +145,6 @@ class Reduction:
             return told + doubt_of_distances(self.splats)
         given = self.cameras is not None or self.given.views is not None
         return told + (doubts_of_views(self.splats, self.seen) if given else [])
-
-    @cached_property
-    def _visibility(self) -> VisibilitySource | None:
-        if self.seen is None:
-            return None
-        source = visibility_source(self.seen, progress=self.progress)
-        return _Remembering(source, source.views)
 
     def resolved(self, budget: Budget, name: str, file: str, sh_degree: int | None = None) -> ResolvedBudget:
         """Resolve a budget for the scene, called `name` in errors.
@@ -159,36 +155,36 @@ class Reduction:
             file: a file name; its suffix is the format for `Budget.fit`.
             sh_degree: of the result; None is the scene's.
         """
-        splats, say = self.splats, self.say
-        if self.tiles is not None:
-            return resolved_in_tiles(budget, self.total, splats, name, file, say)
+        splats, say, total = self.splats, self.say, self.total
         if budget.min_psnr is not None or budget.min_ssim is not None:
             return self._resolved_for_quality(Quality(budget.min_psnr or 0.0, budget.min_ssim or 0.0), file)
 
         def tried(count: int) -> Splats:
-            small = merge(splats, count, method="fast") if self.recovered else self(count)
-            return small.splats
+            if self.recovered and self.plan is None:
+                return merge(splats, count, method="fast").splats
+            return whole(self(count).splats)  # in tiles, recovery starts from this one
 
         if budget.bytes is not None:
             if sh_degree is not None:
                 splats = splats.with_sh_degree(sh_degree)
-            most = int(budget.bytes * _BYTES_SAFETY) if self.recovered else budget.bytes
-            found = count_for_bytes(splats, most, file, tried)
+            exact = self.plan is not None and scene_format(file).suffix == ".ply"
+            most = int(budget.bytes * _BYTES_SAFETY) if self.recovered and not exact else budget.bytes
+            found = count_for_bytes(splats, most, file, tried, None if self.plan is None else total)
         else:
-            found = budget.of(len(splats), name)
+            found = budget.of(total, name)
             check_positions(file, splats, found)
         if budget.layers is not None:
-            whole = found
-            found, layers = count_for_layers(whole, budget.layers, tried)
-            if found < whole:
+            before = found
+            found, layers = count_for_layers(before, budget.layers, tried)
+            if found < before:
                 say(
                     f"{budget.fit}: near views blend more than {budget.layers} Gaussians per pixel at "
-                    f"{whole:,}, {layers:.0f} at {found:,}"
+                    f"{before:,}, {layers:.0f} at {found:,}"
                 )
         if budget.fit is not None:
             fits = plural(found, "Gaussian") if budget.bytes is None else f"about {plural(found, 'Gaussian')}"
             all_fit = f"nothing to do, all {plural(found, 'Gaussian')} already fit"
-            say(f"{budget.fit}: {all_fit if found == len(splats) else fits}")
+            say(f"{budget.fit}: {all_fit if found == total else fits}")
         return ResolvedBudget(found, budget.bytes, file)
 
     def _resolved_for_quality(self, wanted: Quality, file: str) -> ResolvedBudget:
@@ -197,17 +193,24 @@ class Reduction:
 
         splats = self.splats
         pool = plan_pool(
-            splats, _QUALITY_VIEWS, seed=self.given.seed, rows=_POOL_SAMPLE, progress=self.progress
+            splats,
+            _QUALITY_VIEWS,
+            seed=self.given.seed,
+            rows=_POOL_SAMPLE,
+            represents=self.total / len(splats),
+            progress=self.progress,
         )
         cameras = pool.cameras.resized(_QUALITY_SIDE)
 
         def reduce(count: int) -> Splats:
-            small = as_file(self(count).splats, file)
+            small = as_file(whole(self(count).splats), file)
             self.progress("quality", 0, 0)
             return small
 
-        found, near = count_for_quality(splats, wanted, cameras, reduce)
-        if found == len(splats):
+        drawn = self.dense.images(cameras)
+        renders = [drawn[view] for view in range(len(cameras))]
+        found, near = count_for_quality(renders, self.total, wanted, cameras, reduce)
+        if found == self.total:
             self.say(f"no smaller count was found that keeps the quality; keeping all {found:,} Gaussians")
         else:
             stage = " before recovery" if self.recovered else ""
@@ -215,28 +218,9 @@ class Reduction:
             self.say(
                 f"{plural(found, 'Gaussian')} keep {near}{stage}, in {views} generated to choose the count"
             )
-        return ResolvedBudget(found, file=file, wanted=wanted, dense=splats, cameras=cameras)
-
-
-class _Remembering:
-    """A source of visibility that keeps that of its first scene, with which every reduction starts."""
-
-    def __init__(self, source: VisibilitySource, views: Cameras) -> None:
-        self.source, self.views = source, views
-        self.first: tuple[Splats, SampledVisibility] | None = None
-
-    def __call__(self, scene: Splats) -> SampledVisibility:
-        if self.first is not None and _same(self.first[0], scene):
-            return self.first[1]
-        seen = self.source(scene)
-        if self.first is None:
-            self.first = scene, seen
-        return seen
-
-
-def _same(a: Splats, b: Splats) -> bool:
-    """Return whether two scenes share their geometry arrays; scales are clamped anew by each reduction."""
-    return all(getattr(a, name) is getattr(b, name) for name in ("means", "quats", "logit_opacities"))
+        return ResolvedBudget(
+            found, file=file, wanted=wanted, renders=renders, cameras=cameras, total=self.total
+        )
 
 
 @contextmanager
@@ -262,16 +246,16 @@ def reducing(
     callbacks: dict[str, Any] = {"progress": progress, "say": say}
     if isinstance(scene, Splats):
         counted(len(scene))
-        yield Reduction(scene, given, **options, **callbacks)
+        yield Reduction(InMemory(scene), given, **options, **callbacks)
         return
     given = replace(given, beside=given.beside or scene.path)
     if tiling is not None:
-        from g2ard.jobs.in_tiles import opened
+        from g2ard.jobs.dense import opened
 
-        with opened(scene, tiling, 1.0, planned=planned, **callbacks) as tiles:
+        with opened(scene, tiling, 1.0, options["config"], planned=planned, **callbacks) as tiles:
             counted(tiles.plan.count)
-            options |= {"notes": tiles.store.notes if tiles.store else (), **callbacks}
-            yield Reduction(tiles.sample(options["config"]), given, tiles=tiles, **options)
+            options |= {"notes": tiles.notes, "plan": tiles.plan, **callbacks}
+            yield Reduction(tiles.dense, given, **options)
         return
     progress("read", 0, 0)
     if scene.kind == "points":
@@ -286,7 +270,7 @@ def reducing(
     else:
         splats, notes = load_scene(scene, say), scene.notes
     counted(len(splats))
-    yield Reduction(splats, given, notes=notes, **options, **callbacks)
+    yield Reduction(InMemory(splats), given, notes=notes, **options, **callbacks)
 
 
 @checks_arguments

@@ -9,9 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from g2ard.errors import InputError
-from g2ard.io.scene_formats import scene_format
 from g2ard.io.source import Source
-from g2ard.jobs.budget import Budget
 from g2ard.stages.simplify import Default, SimplifyConfig
 from g2ard.system.memory import usable_memory
 from g2ard.tiles.ingest import TILE_ROWS
@@ -71,16 +69,14 @@ def cut_into(folder: Path | None, rows: int) -> str:
 
 
 def is_tiled(source: Source, tiling: Tiling) -> bool:
-    """Return whether a scene is a folder of several tiles or has too many Gaussians for one piece.
-
-    Point clouds are never processed in tiles.
-    """
-    if source.store is not None:
-        return len(source.store.tiles) > 1
-    file, most = source.file, tiling.most_rows
-    if file.is_file() and file.suffix.lower() != ".json" and file.stat().st_size < _LEAST_ROW_BYTES * most:
+    """Return whether a scene or point cloud is a folder of several tiles or is too large for one piece."""
+    most, files = tiling.most_rows, [source.file, *(other.file for other in source.others)]
+    known = all(file.is_file() and file.suffix.lower() != ".json" for file in files)
+    if known and sum(file.stat().st_size for file in files) < _LEAST_ROW_BYTES * most:
         return False
-    return source.kind == "splats" and source.count > most
+    if source.kind == "splats" and source.store is not None:
+        return len(source.store.tiles) > 1
+    return source.kind != "views" and source.count > most
 
 
 def refuse_whole(source: Source, options: Sequence[str]) -> None:
@@ -98,28 +94,23 @@ def refuse_whole(source: Source, options: Sequence[str]) -> None:
 
 
 def needs_whole(
-    config: SimplifyConfig | DistillConfig,
-    preset: str | None = None,
-    budgets: Sequence[Budget] = (),
-    file: str = "scene.ply",
-    **options: object,
+    config: SimplifyConfig | DistillConfig, preset: str | None = None, **options: object
 ) -> list[str]:
     """Return what needs the whole scene in memory, as options.
 
-    Tiles merge by the method `default`, all together along Morton order in one step, and learn from renders.
+    Tiles merge by the method `default`, all together along Morton order in one step. The paper's method and
+    rounds with recovery begin with most of the scene's Gaussians.
 
     Args:
         config: of a simplification or a distillation.
         preset: from which the config may come.
-        file: name of the output; only in a .ply do all Gaussians take as many bytes.
         options: options of the command that need the whole scene if they are given.
 
-    >>> from g2ard.jobs.budget import Budget
     >>> from g2ard.stages.simplify import SimplifyConfig
-    >>> needs_whole(SimplifyConfig(), budgets=[Budget(fit="web")], clean=False)
+    >>> needs_whole(SimplifyConfig(), clean=False)
     []
-    >>> needs_whole(SimplifyConfig("fast"), budgets=[Budget(min_psnr=30, min_ssim=0.9)], clean=True)
-    ['--method fast', '--min-psnr 30', '--min-ssim 0.9', '--clean']
+    >>> needs_whole(SimplifyConfig("fast"), clean=True)
+    ['--method fast', '--clean']
     """
     distill = None if isinstance(config, SimplifyConfig) else config
     simplify = config if isinstance(config, SimplifyConfig) else config.simplify
@@ -129,16 +120,9 @@ def needs_whole(
     else:
         given[f"--method {simplify.method}"] = simplify.method != "default"
         if distill is not None:
-            given["--set select.views_count"] = distill.select.views_count is not None
             given["--schedule paper"] = distill.recover.schedule.round_steps > 0
-            given["--recovery-time"] = distill.recover.recovery_time is not None
-            given["--engine"] = distill.recover.engine != "fused"
         if isinstance(simplify, Default):
             steps = simplify.morton_premerge_steps
             given["--set simplify.morton_premerge_steps"] = steps not in (None, usual)
-    for budget in budgets:
-        given[f"--fit {budget.fit}"] = budget.bytes is not None and scene_format(file).suffix != ".ply"
-        given[f"--min-psnr {budget.min_psnr}"] = budget.min_psnr is not None
-        given[f"--min-ssim {budget.min_ssim}"] = budget.min_ssim is not None
     given |= {f"--{name.replace('_', '-')}": bool(value) for name, value in options.items()}
     return [option for option, is_given in given.items() if is_given]

@@ -14,10 +14,10 @@ from numpy.typing import ArrayLike, NDArray
 from g2ard.config.checks import checks_arguments
 from g2ard.io.types import ViewSet
 from g2ard.pipeline.config import DistillConfig, SelectConfig
+from g2ard.pipeline.dense import Dense, InMemory, whole
 from g2ard.pipeline.steps import Steps
 from g2ard.progress import Progress, plural, silent
 from g2ard.rendering.targets import Exposed, Photos, PhotosOrRenders, Subset, Targets, checked_targets
-from g2ard.rendering.visibility import visibility_source
 from g2ard.report.run import DistillReport, RoundReport, StageSeconds, ViewsReport
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats
@@ -25,7 +25,6 @@ from g2ard.stages.recover.config import RecoverConfig
 from g2ard.stages.recover.loop import checked_weights
 from g2ard.stages.recover.optimize import Watch
 from g2ard.stages.select import SurfaceOptions, select
-from g2ard.stages.simplify import simplify
 from g2ard.stages.simplify.reduce import SimplifyReport
 from g2ard.system.shown import Shown
 
@@ -96,7 +95,7 @@ class Distilled(Shown):
 
 @checks_arguments
 def distill(
-    prior: Splats,
+    prior: Splats | Dense,
     budget: int,
     targets: Targets,
     config: DistillConfig | None = None,
@@ -114,8 +113,8 @@ def distill(
     ⌈0.75·N_{r−1}⌉) with recovery after each.
 
     Args:
-        prior: a trained scene or a lifted point cloud; cameras are in world coordinates, including its
-            offset.
+        prior: a trained scene or a lifted point cloud, in memory or in tiles; cameras are in world
+            coordinates, including its offset.
         budget: N_S, at most the prior's count.
         targets: photos, or the prior's own renders.
         config: see `DistillConfig`.
@@ -135,24 +134,25 @@ def distill(
         InputError: the budget does not fit, or no view sees the prior.
         KeyboardInterrupt: after Ctrl-C; the same call resumes from `work`.
     """
-    config, targets, prior = config or DistillConfig(), checked_targets(targets), prior.narrowed()
+    config, targets = config or DistillConfig(), checked_targets(targets)
+    dense: Dense = InMemory(prior.narrowed()) if isinstance(prior, Splats) else prior
     if validation is not None:
         validation = checked_targets(validation, "validation")
     schedule, counts, steps = config.recover.schedule, [budget], Steps(work, progress)
     if schedule.round_steps > 0:
-        counts = config.simplify.rounds(len(prior), budget, recovered=True)
+        counts = config.simplify.rounds(dense.total, budget, recovered=True)
     given = checked_weights(weights, len(targets.cameras))
     photos = isinstance(targets, Photos | PhotosOrRenders)
-    scene, protected, selecting, log = prior, None, 0.0, []
+    total, protected, selecting, log = dense.total, None, 0.0, []
     for number, count in enumerate(counts, start=1):
         if number == 1 or config.select.reselect:
             began = time.monotonic()
-            rows, weighed, views = selected(scene, targets.cameras, config, given, progress)
+            rows, weighed, views = selected(dense.sample, targets.cameras, config, given, progress)
             chosen = targets if rows is None else Subset(targets, rows)
             selecting += time.monotonic() - began
-        drawn = (chosen, validation) if budget < len(prior) else ()  # it may be its own teacher
+        drawn = (chosen, validation) if budget < total else ()  # it may be its own teacher
         simplified, report, protected = _simplified(
-            steps, number, scene, count, budget, targets.cameras, config, protected, progress, drawn
+            steps, number, dense, count, budget, targets.cameras, config, protected, progress, drawn
         )
         scene, recoveries = simplified, []
         final = number == len(counts)
@@ -172,6 +172,7 @@ def distill(
                 time_left=time_left if name == _FINAL else None,
             )
             recoveries.append(recovery)
+        dense = InMemory(scene)
         log.append(RoundReport(count, report, tuple(recoveries)))
     seconds = StageSeconds(
         targets=steps.filling,
@@ -237,7 +238,7 @@ def draw_weights(
 def _simplified(
     steps: Steps,
     number: int,
-    scene: Splats,
+    dense: Dense,
     count: int,
     budget: int,
     cameras: Cameras,
@@ -251,25 +252,26 @@ def _simplified(
     Args:
         drawn: targets that the recovery to come draws, rendered first.
     """
-    blind = config.simplify.method == "paper" or count == len(scene)
-    content = [config.simplify, count, budget, None if blind else cameras, protected]
+    blind = config.simplify.method == "paper" or count == dense.total
+    content = [config.simplify, count, budget, None if blind else cameras, protected, *dense.identity()]
 
     def step(_: Path | None) -> tuple[Splats, SimplifyReport, dict[str, Any]]:
         steps.fill(*drawn)
         began = time.monotonic()
-        done = simplify(
-            scene,
+        done = dense.merged(
             count,
-            config=config.simplify,
-            visibility=None if blind else visibility_source(cameras, progress=progress),
+            None if blind else cameras,
+            config.simplify,
             protected=protected,
             final_budget=budget,
             progress=progress,
         )
         report = replace(done.report, seconds=time.monotonic() - began)
-        return done.splats, report, {"protected": done.protected}
+        flags = np.zeros(count, bool) if done.protected is None else done.protected
+        return whole(done.splats), report, {"protected": flags}
 
-    done, report, arrays = steps.run(f"simplified-{number}", scene, lambda: content, SimplifyReport, step)
+    name, like = f"simplified-{number}", dense.sample
+    done, report, arrays = steps.run(name, like, lambda: content, SimplifyReport, step)
     if config.recover.sh_degree is not None:
         done = done.with_sh_degree(config.recover.sh_degree)
     return done, report, arrays["protected"]

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from g2ard import _core
 from g2ard.progress import Progress, silent
-from g2ard.rendering.renderer import arrays_of, centred, settings_for, view_of
+from g2ard.rendering.renderer import RasterSettings, View, arrays_of, centred, settings_for, view_of
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.samples import evenly_spaced
 from g2ard.scene.splats import SH_C0, Splats
@@ -38,30 +40,56 @@ def recoloured(dense: Splats, small: Splats, views: Cameras, progress: Progress 
         dense: rows in an order that depends only on content, because equal depths are drawn in it.
         views: up to 16 of them are rendered, evenly spaced.
     """
-    chosen = views.take(evenly_spaced(len(views), _VIEWS))
+    chosen = seen_by(views)
+    settings = settings_for(dense.means, antialiased=dense.antialiased)
+    dense, cameras = centred(dense, chosen)
+    arrays = arrays_of(dense)
+
+    def shown(view: int) -> tuple[_Image, _Image]:
+        image, alpha, *_ = _drawn(_core.Rasterizer(), arrays, view_of(cameras, view, settings), settings)
+        return image, alpha
+
+    return shifted(small, chosen, shown, settings, progress)
+
+
+def seen_by(views: Cameras) -> Cameras:
+    """Return the views to which colours are fitted."""
+    return views.take(evenly_spaced(len(views), _VIEWS))
+
+
+def shifted(
+    small: Splats,
+    views: Cameras,
+    shown: Callable[[int], tuple[_Image, _Image]],
+    settings: RasterSettings,
+    progress: Progress = silent,
+) -> Splats:
+    """Shift the colours of a simplified scene, see `recoloured`.
+
+    Args:
+        shown: view → (H, W, 3) image and (H, W) opacity of the dense scene.
+        settings: conventions of both scenes.
+    """
     progress("colours", 0, 0)
+    drawable, cameras = centred(small, views)
+    arrays = arrays_of(drawable)
 
     def sums(view: int) -> NDArray[np.float64]:
-        image, alpha = drawn(dense_arrays, of_dense, view)[1:]
-        rasterizer, own_image, own_alpha = drawn(arrays, of_small, view)
+        image, alpha = shown(view)
+        rasterizer, camera = _core.Rasterizer(), view_of(cameras, view, settings)
+        own_image, opacity, *_ = _drawn(rasterizer, arrays, camera, settings)
+        alpha, own_alpha = alpha[..., None], opacity[..., None]
         error = own_alpha * image - alpha * own_image
         weight = np.broadcast_to(alpha * own_alpha, image.shape)
         found = [rasterizer.backward(arrays, np.ascontiguousarray(a))[4] for a in (error, weight)]
         return np.stack(found).astype(np.float64)
 
-    def drawn(
-        scene: tuple[_Image, ...], cameras: Cameras, view: int
-    ) -> tuple[_core.Rasterizer, _Image, _Image]:
-        rasterizer = _core.Rasterizer()
-        camera = view_of(cameras, view, settings)
-        image, alpha, *_ = rasterizer.forward(scene, camera, settings, list(_DARKNESS))
-        return rasterizer, image, alpha[..., None]
-
-    settings = settings_for(dense.means, antialiased=dense.antialiased)
-    (dense, of_dense), (drawable, of_small) = centred(dense, chosen), centred(small, chosen)
-    dense_arrays, arrays = arrays_of(dense), arrays_of(drawable)
     error = weight = np.zeros_like(arrays[4], np.float64)
-    for found in in_threads(sums, range(len(chosen))):
+    for found in in_threads(sums, range(len(views))):
         error, weight = error + found[0], weight + found[1]
     shift = error / np.maximum(weight + _FLOOR * weight.mean(), np.finfo(np.float64).tiny)
     return replace(small, sh0=(small.sh0 + shift / SH_C0).astype(np.float32))
+
+
+def _drawn(rasterizer: _core.Rasterizer, arrays: Any, camera: View, settings: RasterSettings) -> Any:
+    return rasterizer.forward(arrays, camera, settings, list(_DARKNESS))

@@ -97,7 +97,7 @@ def fingerprint_of(targets: Targets) -> str:
 
 def _source(targets: Targets) -> str:
     """Return the identity of the images' sources, or a hash of the images if their class is the user's."""
-    own = type(targets).__module__ == __name__
+    own = type(targets).__module__.startswith("g2ard.")
     return str(targets.source) if own else _content(targets)  # type: ignore[attr-defined]
 
 
@@ -114,7 +114,7 @@ def checked_targets(targets: Targets, parameter: str = "targets") -> Targets:
     Raises:
         InputError: no cameras, or on access an image that does not fit its view.
     """
-    if isinstance(targets, _Cached | _Chosen):
+    if isinstance(targets, Cached | _Chosen):
         return targets
     if not isinstance(getattr(targets, "cameras", None), Cameras) or not hasattr(targets, "__getitem__"):
         raise InputError(
@@ -165,7 +165,7 @@ def as_image(image: Any, cameras: Cameras, view: int, parameter: str) -> NDArray
 
 def fill(targets: Targets, progress: Progress, views: Sequence[int] | None = None) -> None:
     """Render what memory will hold of some views, all by default; photos are read when they are drawn."""
-    if isinstance(targets, TeacherRenders | _Chosen):
+    if isinstance(targets, Cached | _Chosen):
         targets.fill(progress, views)
 
 
@@ -296,7 +296,7 @@ _KEEPING = threading.Lock()
 """Held while targets change what they keep; one for all, so that targets can be pickled."""
 
 
-class _Cached(_Sourced, Shown):
+class Cached(_Sourced, Shown):
     """Cache of what `_make` returns, up to `limit` bytes, first come first kept."""
 
     def __init__(self, cameras: Cameras, limit: int) -> None:
@@ -312,6 +312,9 @@ class _Cached(_Sourced, Shown):
     @abstractmethod
     def _make(self, view: int) -> NDArray[Any]:
         """Create the image of one view, as it is cached."""
+
+    def fill(self, progress: Progress, views: Sequence[int] | None = None) -> None:
+        """Make images before they are drawn, if that takes long; see `fill`."""
 
     def _stored(self, view: int) -> NDArray[Any]:
         return self._cached(self._kept, view, self._make)
@@ -331,7 +334,7 @@ class _Cached(_Sourced, Shown):
         return made
 
 
-class Photos(_Cached):
+class Photos(Cached):
     """Photos of `cameras`: their files, undistorted and at each camera's size, or given images.
 
     Alpha is composited over the background. A photo with a mask is black outside of it. An exposure is the
@@ -452,7 +455,18 @@ _RENDER_LEVELS = np.float32(65_535)
 """Largest value of a render rounded to 16 bits."""
 
 
-class TeacherRenders(_Cached):
+def rounded(image: NDArray[np.float32]) -> NDArray[np.uint16]:
+    """Round a render in [0, 1] to 16 bits, in place."""
+    image *= _RENDER_LEVELS
+    return np.rint(image, out=image).astype(np.uint16)
+
+
+def unrounded(image: NDArray[np.uint16]) -> NDArray[np.float32]:
+    """Return the render that `rounded` stored."""
+    return np.multiply(image, 1 / _RENDER_LEVELS, dtype=np.float32)
+
+
+class TeacherRenders(Cached):
     """Renders of the dense scene: (H, W, 3) float32, clipped to [0, 1].
 
     They are cached as float32, or rounded to 16 bits if all of them and the scene exceed the limit.
@@ -509,10 +523,7 @@ class TeacherRenders(_Cached):
 
     def _make(self, view: int) -> NDArray[np.float32 | np.uint16]:
         image = self._shared_renderer().clipped(self.cameras[view])
-        if not self._rounded:
-            return image
-        image *= _RENDER_LEVELS
-        return np.rint(image, out=image).astype(np.uint16)
+        return rounded(image) if self._rounded else image
 
     def _shared_renderer(self) -> Renderer:
         with _KEEPING:
@@ -527,7 +538,7 @@ class TeacherRenders(_Cached):
 
     def __getitem__(self, view: int) -> NDArray[np.float32]:
         image = self._stored(view)
-        return np.multiply(image, 1 / _RENDER_LEVELS, dtype=np.float32) if self._rounded else image
+        return unrounded(image) if self._rounded else image
 
 
 class PhotosOrRenders(_Chosen):
@@ -536,6 +547,7 @@ class PhotosOrRenders(_Chosen):
     As in sec. 3.1: "real images are used when available, otherwise teacher renders".
 
     Args:
+        teacher: the dense scene, or a function that returns its renders in some views.
         exposures: exposures of the photos, see `Photos`.
         limit: bytes cached in memory per kind.
         renders: further arguments of `TeacherRenders`.
@@ -544,7 +556,7 @@ class PhotosOrRenders(_Chosen):
     def __init__(
         self,
         cameras: Cameras,
-        teacher: Splats,
+        teacher: Splats | Callable[[Cameras], Targets],
         *,
         background: Colour = BLACK,
         exposures: Mapping[str, NDArray[np.float64]] | None = None,
@@ -554,7 +566,11 @@ class PhotosOrRenders(_Chosen):
         pictured = np.array([path is not None for path in cameras.image_paths], bool)
         parts = [cameras.take(np.flatnonzero(mask)) for mask in (pictured, ~pictured)]
         photos = Photos(parts[0], background=background, exposures=exposures, limit=limit)
-        others = TeacherRenders(teacher, parts[1], background=background, limit=limit, **renders)
+        others: Targets
+        if isinstance(teacher, Splats):
+            others = TeacherRenders(teacher, parts[1], background=background, limit=limit, **renders)
+        else:
+            others = teacher(parts[1])
         rows = np.where(pictured, np.cumsum(pictured), np.cumsum(~pictured)) - 1
         places = [(photos if photo else others, int(row)) for photo, row in zip(pictured, rows, strict=True)]
         super().__init__(cameras, places)

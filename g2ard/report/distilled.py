@@ -1,4 +1,4 @@
-"""Report page and preview picture of a distillation, and the report page of a run in tiles."""
+"""Report page and preview picture of a distillation."""
 
 from collections.abc import Sequence
 from itertools import zip_longest
@@ -16,7 +16,7 @@ from g2ard.rendering.exposure import rendered
 from g2ard.rendering.renderer import Renderer
 from g2ard.rendering.targets import Targets, mask_of
 from g2ard.report.page import Page, Shown
-from g2ard.report.run import COLUMNS, LOST, KindScore, RunReport, TiledReport, cells
+from g2ard.report.run import COLUMNS, LOST, KindScore, RunReport, cells
 from g2ard.scene.cameras import rows_by_kind
 from g2ard.scene.splats import Splats
 from g2ard.stages.evaluate import ViewScore, evaluate
@@ -105,7 +105,7 @@ def edges_line(kinds: Sequence[KindScore]) -> str | None:
     return f"Edges, wires and text (PSNR of gradients): {', '.join(found)}." if found else None
 
 
-def verdict(report: RunReport | TiledReport) -> str:
+def verdict(report: RunReport) -> str:
     """Summarise a run in one sentence.
 
     >>> from types import SimpleNamespace
@@ -149,38 +149,6 @@ def _worst(scores: Sequence[ViewScore]) -> list[int]:
     kinds = [sorted(rows, key=lambda row: scores[row].psnr) for rows in found.values()]
     kinds.sort(key=lambda rows: fmean(scores[row].psnr for row in rows))
     return [row for turn in zip_longest(*kinds) for row in turn if row is not None][:_SHOWN]
-
-
-def tiled_report(path: Path, title: str, report: TiledReport) -> None:
-    """Write the HTML page of a run in tiles."""
-    scores, views = report.scores, report.views
-    shown = sorted((tile for tile in scores.tiles if tile.pixels), key=lambda t: (t.recovered, t.tile))
-    page = Page(title, verdict(report))
-    page.table(COLUMNS, cells(scores.kinds))
-    page.paragraph(
-        f"Simplified {scores.simplified:.2f} dB, {RESULT} {scores.recovered:.2f} dB over the "
-        f"{scores.pixels:,} pixels that tiles own in {plural(views['test'], 'held-out view')}; "
-        f"{plural(views['train'], 'training view')}, {scores.steps:,} recovery steps of all tiles "
-        f"together, {report.seconds['total']:,.0f} s."
-    )
-    page.heading("Tiles, worst first")
-    page.table(
-        ["tile", "Gaussians", "simplified, dB", f"{RESULT}, dB", "steps", "pixels"],
-        [
-            [
-                str(tile.tile),
-                f"{tile.count:,}",
-                f"{tile.simplified:.2f}",
-                f"{tile.recovered:.2f}",
-                f"{tile.steps:,}",
-                f"{tile.pixels:,}",
-            ]
-            for tile in shown
-        ],
-    )
-    if others := len(scores.tiles) - len(shown):
-        page.paragraph(f"The {plural(others, 'other tile')} own no pixel in a held-out view.")
-    page.write(path)
 
 
 def preview(

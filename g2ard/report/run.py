@@ -11,7 +11,6 @@ from typing import Any
 from g2ard.io.labels import RESULT
 from g2ard.io.reports import LEFT_OUT, Report
 from g2ard.progress import plural
-from g2ard.rendering.targets import RENDERS
 from g2ard.scene.cameras import USUAL, rows_by_kind
 from g2ard.stages.evaluate import Evaluation, Means, ViewScore
 from g2ard.stages.recover.anchors import PriorMeasures
@@ -42,11 +41,11 @@ class KindScore(Report):
     Args:
         kind: near, standing, anywhere or another kind that views state; otherwise `usual` for generated
             views and `given` for the user's.
-        ssim: mean SSIM; None for a scene in tiles.
+        ssim: mean SSIM; None if it was not measured.
         worst: name of the view with the lowest PSNR after recovery.
         worst_psnr: PSNR of that view, dB.
         lost: number of views that lost over 0.05 dB.
-        edge_psnr: mean PSNR of gradients, dB; None for a scene in tiles.
+        edge_psnr: mean PSNR of gradients, dB; None if it was not measured.
         detail: mean correlation of gradients; None for a scene in tiles.
     """
 
@@ -183,7 +182,7 @@ class Packed(Report):
 
 @dataclass(frozen=True)
 class RunReport(Report):
-    """Report of a run in one piece.
+    """Report of a run.
 
     Args:
         lifted: whether the scene was lifted from points.
@@ -203,6 +202,7 @@ class RunReport(Report):
         settings: every setting by path.
         seconds: by stage.
         packed: scores of a file that is not .ply.
+        tiles: number of tiles of a dense scene in tiles; `peak_rss_bytes` is then that of all processes.
     """
 
     input_count: int
@@ -228,6 +228,8 @@ class RunReport(Report):
     settings: dict[str, Any]
     seconds: dict[str, float]
     packed: Packed | None = field(default=None, metadata=LEFT_OUT)
+    tiles: int | None = field(default=None, metadata=LEFT_OUT)
+    peak_rss_bytes: int | None = field(default=None, metadata=LEFT_OUT)
 
     @property
     def sizes(self) -> str:
@@ -262,67 +264,3 @@ class RunReport(Report):
         if self.photos or self.lifted:
             return f"{plural(self.output_count, 'Gaussian')} from {self.source}"
         return f"{self.output_count:,} of {plural(self.input_count, 'Gaussian')}"
-
-
-@dataclass(frozen=True)
-class TileScore(Report):
-    """Score of one tile; its PSNR is meaningless without pixels."""
-
-    tile: int
-    count: int
-    simplified: float
-    recovered: float
-    pixels: int
-    steps: int
-
-
-@dataclass(frozen=True)
-class TiledScores(Report):
-    """Scores on held-out views, over all pixels owned by tiles."""
-
-    simplified: float
-    recovered: float
-    pixels: int
-    kinds: tuple[KindScore, ...]
-    steps: int
-    tiles: tuple[TileScore, ...]
-
-
-@dataclass(frozen=True)
-class TiledReport(Report):
-    """Report of a run in tiles.
-
-    Args:
-        tiles: Gaussians of the result by tile.
-        notes: number of each kind of note on the scene's file.
-        peak_rss_bytes: peak memory of all processes.
-        size: image size of the held-out views.
-        views: number of views for training and for scoring.
-    """
-
-    input_count: int
-    output_count: int
-    tiles: list[int]
-    notes: dict[str, int]
-    seconds: dict[str, float]
-    peak_rss_bytes: int | None
-    scores: TiledScores
-    size: str
-    views: dict[str, int]
-    against = RENDERS
-    stages = f"simplified → {RESULT}"
-
-    @property
-    def title(self) -> str:
-        """Numbers before and after."""
-        return f"{self.input_count:,} → {self.output_count:,}"
-
-    @property
-    def made(self) -> str:
-        """Number of Gaussians of the result, and of the scene."""
-        return f"{self.output_count:,} of {plural(self.input_count, 'Gaussian')}"
-
-    @property
-    def kinds(self) -> tuple[KindScore, ...]:
-        """Scores by kind of view."""
-        return self.scores.kinds

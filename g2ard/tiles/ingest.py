@@ -154,9 +154,10 @@ def _manifest(
         "settings": settings,
         "notes": [asdict(note) for note in notes],
     }
-    if scene is not None:
-        return {**manifest, "axes": scene.axes} | ({} if scene.up is None else {"up": scene.up})
-    return {**manifest, "axes": stream.axes or guessed_axes(stream.sample)}
+    if isinstance(stream, PointStream):
+        system = {} if stream.system is None else {"system": stream.system}
+        return {**manifest, "axes": stream.axes or guessed_axes(stream.sample), **system}
+    return {**manifest, "axes": stream.axes} | ({} if stream.up is None else {"up": stream.up})
 
 
 def _opened(
@@ -171,7 +172,7 @@ def _opened(
 
 
 def _done(folder: Path, key: str, overwrite: bool) -> TileStore | None:
-    """Return the store if it is complete and has this key, otherwise None.
+    """Return the store if it is complete and has this key, otherwise None; `overwrite` checks its contents.
 
     A broken manifest raises, unless it has this key or `overwrite` is set.
     """
@@ -179,6 +180,8 @@ def _done(folder: Path, key: str, overwrite: bool) -> TileStore | None:
         return None
     try:
         store = TileStore.open(folder)
+        if overwrite:
+            store.check_all()
     except InputError:
         if overwrite or _key_in(folder / MANIFEST) == key:
             return None

@@ -14,6 +14,7 @@ from g2ard.io.tile_store import TileStore
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats, unit_quats
 from g2ard.stages.simplify.pairs import fit_opacities
+from g2ard.stages.simplify.reduce import SimplifyReport, SimplifyRound
 from g2ard.system.keys import key_of
 from g2ard.tiles.sights import Sights
 from g2ard.tiles.simplify import TiledRun
@@ -31,21 +32,10 @@ class Merged:
 
     Args:
         splats: the scene, with fitted opacities; its identity is a hash of the names of its files.
-        unseen: Gaussians of the dense scene that no view sees; None without views.
-        opacity_lost: share of the light that opaque pixels stop but let through in the merged scene, before
-            opacities are fitted; None if not measured.
-        sights: visibility of the dense tiles, for recovery; None without views.
     """
 
     splats: PartsStream
-    sights: Sights | None
-    unseen: int | None = None
-    opacity_lost: float | None = None
-
-    @property
-    def views(self) -> int:
-        """Number of views."""
-        return 0 if self.sights is None else len(self.sights.cameras)
+    report: SimplifyReport
 
 
 def simplify_tiles(run: TiledRun, budget: int, views: Cameras | None = None, *, gaps: bool = False) -> Merged:
@@ -70,11 +60,11 @@ def simplify_tiles(run: TiledRun, budget: int, views: Cameras | None = None, *, 
         raise InputError(
             f"expected 1 to {store.count:,} (the scene's Gaussians), got {budget:,}", parameter="budget"
         )
-    frame = run.sampled_frame()  # units that tiles share, so that their costs compare
-    sights = None if views is None else Sights(run, views, frame)
     if budget == store.count:
         whole = scene_in_tiles(store, run.sizes, store.read, key_of(store.key), store.sh_degree)
-        return Merged(whole, sights)
+        return Merged(whole, _report(run, run.sizes, []))
+    frame = run.sampled_frame()  # units that tiles share, so that their costs compare
+    sights = None if views is None else Sights(run, views, frame)
     merged, counts = _merged(run, budget, frame if sights is None else sights.frame, sights)
     if sights is None:
         files, mean = [{"merged": path} for path in merged], None
@@ -92,10 +82,39 @@ def simplify_tiles(run: TiledRun, budget: int, views: Cameras | None = None, *, 
         return finished(small, store.sh_degree)
 
     scene = scene_in_tiles(store, counts, tile, key_of(files), store.sh_degree)
-    if sights is None:
-        return Merged(scene, None)
-    lost = _opacity_lost(run, merged, sights) if gaps else None
-    return Merged(scene, sights, sum(int(load(path, "unseen")[0]) for path in merged), lost)
+    lost = _opacity_lost(run, merged, sights) if gaps and sights is not None else None
+    return Merged(scene, _report(run, counts, merged, seen=sights is not None, lost=lost))
+
+
+def _report(
+    run: TiledRun, counts: Sequence[int], merged: list[Path], *, seen: bool = False, lost: float | None = None
+) -> SimplifyReport:
+    """Describe a merge; `merged` are the results of `merge`, none if nothing was merged."""
+    total, left = run.store.count, sum(counts)
+    kept = alone = clamped = unseen = 0
+    for path in merged:
+        members, limited = load(path, "members", "clamped")
+        kept += int(members.sum())
+        alone += int(np.count_nonzero(members == 1))
+        clamped += int(limited)
+        unseen += int(load(path, "unseen")[0]) if seen else 0
+    step = SimplifyRound(total, total - kept, kept - left, 0, left)
+    return SimplifyReport(
+        input_count=total,
+        output_count=left,
+        merged_members=kept - alone,
+        rounds=(step,) if merged else (),
+        protected=0,
+        nonfinite_rows=0,  # dropped when tiles are written
+        infinite_logits=0,
+        clamped_opacities=clamped,
+        fitted=0,
+        unseen=unseen if seen else None,
+        faded=0,
+        skipped={"alone": alone},
+        opacity_lost=lost,
+        tiles=list(counts),
+    )
 
 
 def _opacity_lost(run: TiledRun, merged: list[Path], sights: Sights) -> float:
@@ -181,7 +200,7 @@ def _runs(run: TiledRun, costs: list[Path], budget: int) -> tuple[list[int], lis
             faint.append(min(missing, size - drawn))
             missing -= faint[-1]
         return kept, faint
-    target = min(sum(kept), int(run.config["morton_premerge_ratio"] * budget))
+    target = min(sum(kept), int(run.pairs_per_row(budget) * budget))
     closed = cheapest([_costs_of(path) for path in costs], sum(kept) - max(target, len(kept)))
     return [n - c for n, c in zip(kept, closed, strict=True)], [0] * len(kept)
 

@@ -10,12 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g2ard import _core
-from g2ard.io.tile_store import TileStore
 from g2ard.rendering.visibility import LONGEST, MOST_VIEWS, NEAR
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.samples import evenly_spaced, weighted_quantile
 from g2ard.system.keys import key_of
-from g2ard.tiles.executor import Workers
 from g2ard.tiles.simplify import COARSE, TiledRun
 from g2ard.tiles.tasks import Task, is_whole, load, save, scene_of
 
@@ -40,7 +38,7 @@ class Sights:
         self.shrunk = float((self.cameras.widths / cameras.widths).mean())
         self.views = written(run.workers.folder, self.cameras)
         self.boxes = boxes_of(run.coarse)
-        light = light_of(run.store, run.coarse, self.cameras, run.workers)
+        light = self._light()
         self.arguments = [
             {
                 **self._chosen(light, tile),
@@ -75,6 +73,26 @@ class Sights:
             {**given, "merged": path, "visibility": seen}
             for given, path, seen in zip(self._inputs(), merged, self.visibility, strict=True)
         ]
+
+    def _light(self) -> NDArray[np.float64]:
+        """Return (V, T) Σ αT² of each tile's coarse Gaussians in each view."""
+        coarse, store, workers = self.run.coarse, self.run.store, self.run.workers
+        here = self.cameras.recentred(store.offset)
+        away = np.linalg.norm(here.positions[:, None] - self.boxes.mean(axis=1), axis=2).min(axis=1)
+        level = "near" if store.count // COARSE[0] <= _MOST_NEAR_GAUSSIANS else "far"
+        given = {"level": level, "near": NEAR * float(np.median(away)) or None}
+        tasks = [
+            Task(
+                "g2ard.tiles.simplify:light",
+                f"light-{number:05}",
+                workers.folder,
+                {"views": list(range(len(here)))[first : first + _VIEWS_PER_TASK], **given},
+                {"coarse": coarse, "views": self.views},
+                cost=min(_VIEWS_PER_TASK, len(here) - first),
+            )
+            for number, first in enumerate(range(0, len(here), _VIEWS_PER_TASK))
+        ]
+        return np.concatenate([load(path, "weights")[0] for path in workers.run(tasks, "light")])
 
     def _inputs(self) -> list[dict[str, Any]]:
         return [{"coarse": self.run.coarse, "views": self.views} for _ in self.run.coarse]
@@ -123,28 +141,3 @@ def written(work: Path, cameras: Cameras) -> Path:
     if not is_whole(path):
         save(path, arrays)
     return path
-
-
-def light_of(store: TileStore, coarse: list[Path], cameras: Cameras, workers: Workers) -> NDArray[np.float64]:
-    """Return (V, T) Σ αT² of each tile's coarse Gaussians in small renders of each view."""
-    level = "near" if store.count // COARSE[0] <= _MOST_NEAR_GAUSSIANS else "far"
-    small = cameras.resized(LONGEST)
-    views = written(workers.folder, small)
-    here = small.recentred(store.offset)
-    middles = boxes_of(coarse).mean(axis=1)
-    away = np.linalg.norm(here.positions[:, None] - middles, axis=2).min(axis=1)
-    near = NEAR * float(np.median(away)) or None
-    chunks = [range(i, min(i + _VIEWS_PER_TASK, len(here))) for i in range(0, len(here), _VIEWS_PER_TASK)]
-    tasks = [
-        Task(
-            "g2ard.tiles.simplify:light",
-            f"light-{number:05}",
-            workers.folder,
-            {"views": list(chunk), "level": level, "near": near},
-            {"coarse": coarse, "views": views},
-            cost=len(chunk),
-        )
-        for number, chunk in enumerate(chunks)
-    ]
-    paths = workers.run(tasks, "light")
-    return np.concatenate([load(path, "weights")[0] for path in paths])

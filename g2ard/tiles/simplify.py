@@ -345,6 +345,7 @@ class TiledRun:
         model = store.render_model
         merging = config.turned("default")
         assert isinstance(merging, Default)
+        self.merging = merging
         self.config = asdict(merging.resolved(antialiased=model == "antialiased"))
         self.sizes = [tile.rows for tile in store.tiles]
         self.coarse: list[Path] = []
@@ -359,6 +360,7 @@ class TiledRun:
         frame: tuple[float, ...] | None = None,
         per_tile: list[dict[str, Any]] | None = None,
         inputs: list[dict[str, Any]] | None = None,
+        module: str = __name__,
     ) -> list[Path]:
         """Run one task per tile; each reads the tile's `coarse` output if there is one."""
         tasks = []
@@ -370,7 +372,7 @@ class TiledRun:
             arguments |= per_tile[tile] if per_tile else {}
             tasks.append(
                 Task(
-                    f"{__name__}:{function}",
+                    f"{module}:{function}",
                     f"{stage}-{tile:05}",
                     self.workers.folder,
                     arguments,
@@ -380,6 +382,12 @@ class TiledRun:
                 )
             )
         return self.workers.run(tasks, stage)
+
+    def pairs_per_row(self, budget: int) -> float:
+        """Return the Gaussians per row of the result from which neighbouring pairs merge."""
+        ratio = self.merging.resolved(ratio=self.store.count / budget).morton_premerge_ratio
+        assert ratio is not None
+        return ratio
 
     def sample(self) -> Splats:
         return join([scene_of(path, "sample") for path in self.coarse])

@@ -247,20 +247,26 @@ def lift_tiles(
     within.mkdir(exist_ok=True)
     points = pour(within, cloud, tile_rows, rows, progress, say)
     writer = TileWriter(folder, points.tree, points.margin, 4 * row_width(0))
-    total, done = sum(points.counts), 0
-    progress("lift", done, total)
+    whole, done = sum(points.counts), 0
+    progress("lift", done, whole)
     for index, count in enumerate(points.counts):
-        splats = _lifted(points, index, cloud, config)
+
+        def lifting(stage: str, done: int, total: int, info: Any = None, before: int = done) -> None:
+            progress(stage, min(before + done, whole), whole)
+
+        splats = _lifted(points, index, cloud, config, lifting)
         for start in range(0, len(splats), _ROWS_AT_ONCE):
             part = splats.take(slice(start, start + _ROWS_AT_ONCE))
             writer.add(packed(part), part.means)
         done += count
-        progress("lift", done, total)
+        progress("lift", done, whole)
     shutil.rmtree(within)
     return writer
 
 
-def _lifted(points: TileWriter, index: int, cloud: PointStream, config: LiftConfig) -> Splats:
+def _lifted(
+    points: TileWriter, index: int, cloud: PointStream, config: LiftConfig, progress: Progress
+) -> Splats:
     """Lift a tile's points with those of its halo as neighbours."""
     core, halo = (
         np.fromfile(points.folder / name, _POINT_DTYPE) for name in (tile_name(index), halo_name(index))
@@ -268,7 +274,7 @@ def _lifted(points: TileWriter, index: int, cloud: PointStream, config: LiftConf
     if not len(core):
         return Splats.create(np.empty((0, 3)), scales=np.empty((0, 3)))
     both = np.concatenate([core, halo])
-    discs, rows = lift_rows(both["far"], both["rgb"], config)
+    discs, rows = lift_rows(both["far"], both["rgb"], config, progress)
     rows = rows[rows < len(core)]
     means = np.ascontiguousarray(core["near"][rows])
     return replace(discs.take(slice(0, len(rows))), means=means, offset=cloud.offset)

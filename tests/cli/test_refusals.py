@@ -141,14 +141,9 @@ WHOLE = {
         ("--method fast", "--method fast"),
         ("--preset paper-lift", "--preset paper-lift"),
         ("--schedule paper", "--schedule paper"),
-        ("--photos", "--photos"),
-        ("--set views_count=10", "--set select.views_count"),
         ("--clean", "--clean"),
         ("--set morton_premerge_steps=3", "--set simplify.morton_premerge_steps"),
-        ("--recovery-time 5m", "--recovery-time"),
     ),
-    "simplify ball.ply -o x.ply --tile-rows 150": (("--min-ssim 0.9", "--min-ssim 0.9"),),
-    "distill ball.ply -o x --format sog --tile-rows 150": (("--fit 50kB", "--fit 50kB"),),
 }
 """Command in tiles → options that need the whole scene, and how they are named."""
 INPUT += [

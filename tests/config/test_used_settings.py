@@ -254,7 +254,7 @@ def _distilled_in_tiles(settings: Mapping[str, Any]) -> object:
     options = DistillOptions(views=UNEVEN, size=48, settings={**FAR, **settings})
     refuse_whole(Source(scene), needs_whole(options.config))
     with preparing(Source(scene), Budget(count=BUDGET), options, tiling) as job:
-        return job.run().splats.whole().fingerprint()
+        return job.run().splats.fingerprint()
 
 
 PRIORS = ("trained", "lift")  # noisy has the terms of lift

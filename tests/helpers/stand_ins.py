@@ -197,11 +197,17 @@ def _lpips(folder: Path) -> None:
     torch.save(linear, folder / "alex.pth")
 
 
+def _survey(path: Path) -> None:
+    path.mkdir()
+    _map_cloud(path / "tile_1.laz")
+
+
 STAND_INS: dict[str, Callable[[Path], None]] = {
     **dict.fromkeys(("scene.ply", "scan.ply", "dense.ply", "city.ply", "room.ply", "tree.spz"), _trained),
     **dict.fromkeys(("guitar.compressed.ply", "park24.ply"), _trained),
     "cloud.ply": _cloud,
     **dict.fromkeys(("cloud.laz", "city.laz", "map.laz", "east.laz", "west.laz"), _map_cloud),
+    "survey": _survey,
     **dict.fromkeys(("photos", "fox"), _photos),
     **dict.fromkeys(("project", "caliterra"), _colmap),
     "chair": _photos_with_alpha,

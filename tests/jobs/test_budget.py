@@ -16,15 +16,16 @@ from g2ard.jobs.budget import DEVICES, LAYERS, Budget
 from g2ard.jobs.budget_search import (
     Quality,
     ResolvedBudget,
+    clipped_images,
     count_for_bytes,
     count_for_quality,
     file_bytes,
-    resolved_in_tiles,
 )
 from g2ard.jobs.close_up import close_up
 from g2ard.jobs.distill import prepare
 from g2ard.jobs.distill_options import DistillOptions
 from g2ard.jobs.simplify import Reduction
+from g2ard.pipeline.dense import InMemory
 from g2ard.scene.splats import Splats
 from g2ard.stages.simplify import simplify
 from helpers.commands import CommandLine, succeeds
@@ -37,7 +38,7 @@ def fast(splats: Splats, count: int) -> Splats:
 
 def test_bytes_too_few_for_a_gaussian_in_tiles() -> None:
     with pytest.raises(InputError, match=r"a\.ply: 100 bytes are too few"):
-        resolved_in_tiles(Budget(fit="0.1kB"), 6000, checkered_ball(9), "scene", "a.ply", print)
+        count_for_bytes(checkered_ball(9), 100, "a.ply", partial(fast, checkered_ball(9)), total=6000)
 
 
 def test_a_small_file_of_a_format_with_a_head_takes_few_trials() -> None:
@@ -66,7 +67,7 @@ def test_the_count_fills_the_bytes(name: str) -> None:
 
 def test_the_count_keeps_the_quality() -> None:
     scene, views = checkered_ball(4000), around(6)
-    counts, looked = [], []
+    dense, counts, looked = (clipped_images(scene, views), 4000), [], []
 
     def reduce(count: int) -> Splats:
         looked.append(count)
@@ -74,19 +75,19 @@ def test_the_count_keeps_the_quality() -> None:
 
     for wanted in (Quality(22, 0), Quality(26, 0), Quality(0, 0.9), Quality(22, 0.9)):
         looked.clear()
-        count, found = count_for_quality(scene, wanted, views, reduce)
+        count, found = count_for_quality(*dense, wanted, views, reduce)
         assert found.meets(wanted)
         assert found.over(wanted) < 0.3
         assert len(looked) <= 8
         counts.append(count)
     assert counts[0] < counts[1]
     assert counts[3] == max(counts[0], counts[2])
-    assert count_for_quality(scene, Quality(200, 0), views, reduce)[0] == 4000
+    assert count_for_quality(*dense, Quality(200, 0), views, reduce)[0] == 4000
     looked.clear()
-    count, found = count_for_quality(scene, Quality(41, 0), views, reduce)  # far above what a quarter keeps
+    count, found = count_for_quality(*dense, Quality(41, 0), views, reduce)  # far above what a quarter keeps
     assert 2000 < count < 4000
     assert found.psnr >= 41
-    assert count_for_quality(scene, Quality(1, 0), views, reduce)[0] == 64
+    assert count_for_quality(*dense, Quality(1, 0), views, reduce)[0] == 64
 
 
 def test_simplify_fits(tmp_path: Path, command_line: CommandLine) -> None:
@@ -104,7 +105,7 @@ def test_simplify_fits(tmp_path: Path, command_line: CommandLine) -> None:
 @pytest.mark.parametrize("recovered", [False, True])
 def test_quest3_bounds_overdraw(recovered: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     scene, said = checkered_ball(6000), []
-    reduce = Reduction(scene, blind=True, recovered=recovered, say=said.append)
+    reduce = Reduction(InMemory(scene), blind=True, recovered=recovered, say=said.append)
     plain = reduce.resolved(Budget(fit="quest3"), "a", "a.ply")
     assert plain.count == reduce.resolved(Budget(fit="web"), "a", "a.ply").count == 6000
     dense = close_up(scene)

@@ -54,9 +54,10 @@ def test_a_dry_run_plans_tiles_like_the_run(scene: str, tmp_path: Path, command_
     told = json.loads(succeeds(command_line, folder, *ask, "--dry-run").out)
     assert sorted(folder.rglob("*")) == before
     ran = json.loads(succeeds(command_line, folder, *ask, "-o", "run").out)
-    assert (told["count"], told["tiles"], told["workers"]) == (ran["output_count"], len(ran["tiles"]), 1)
+    assert (told["count"], told["tiles"], told["workers"]) == (ran["output_count"], ran["tiles"], 1)
     assert told["steps"] == 2
-    assert told["views"] >= sum(ran["views"].values())
+    assert told["views"] >= 4
+    assert told["disk"] > 2 * 3000 * 56
     assert told["seconds"] == pytest.approx(sum(seconds for _, seconds in told["stages"]))
     assert ("tiles" in dict(told["stages"])) == (not store)
 

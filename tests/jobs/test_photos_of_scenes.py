@@ -83,4 +83,4 @@ def test_a_job_uses_photos_over_renders_where_it_has_both(kind: str, tmp_path: P
     job = prepare(BALL, Budget(300), DistillOptions(views=views))
     assert job.photos_over_renders == (kind == "both")
     assert job.reads_photos == (kind != "renders")
-    assert (job.teacher is None) == (kind == "photos")
+    assert (not job.renders) == (kind == "photos")

@@ -14,6 +14,7 @@ from unittest.mock import patch
 
 import numpy as np
 import pytest
+from g2ard.tiles.recover import TileTargets
 
 import g2ard
 from g2ard.pipeline import distill, steps
@@ -31,7 +32,6 @@ from g2ard.stages.recover.config import RecoverConfig
 from g2ard.stages.recover.loop import Loop
 from g2ard.system.cached import cached_property
 from g2ard.system.keys import UNKEYED, key_of
-from g2ard.tiles.recover import TileTargets
 from g2ard.tiles.tasks import Task
 from helpers.scenes import around, checkered_ball
 from helpers.view_files import photo

@@ -1,5 +1,6 @@
 """Folders of tiles and of work: one process at a time, damage found or repaired, no user's file lost."""
 
+import json
 import subprocess
 import sys
 from pathlib import Path
@@ -88,6 +89,28 @@ def test_tiles_of_another_length_are_poured_again(place: Path, tmp_path: Path, l
         file.truncate(length)
     with pytest.raises(InputError, match="the manifest says"):  # of other settings it is not replaced unasked
         ingest(place / "town.ply", folder, tile_rows=800)
+
+
+@pytest.mark.parametrize("name", ["tile-00001.f32", "halo-00000.f32"])
+def test_damaged_tiles_are_written_again_on_request(
+    name: str, place: Path, tmp_path: Path, command_line: CommandLine
+) -> None:
+    words = ("ingest", place / "town.ply", "-o", "tiles", "--tile-rows", 700)
+    succeeds(command_line, tmp_path, *words)
+    before = files_of(tmp_path / "tiles")
+    flipped(tmp_path / "tiles" / name)
+    assert "skipped" in succeeds(command_line, tmp_path, *words).err
+    succeeds(command_line, tmp_path, *words, "-w")
+    assert files_of(tmp_path / "tiles") == before
+
+
+def test_a_dry_run_of_ingest(place: Path, tmp_path: Path, command_line: CommandLine) -> None:
+    words = ("ingest", place / "town.ply", "--tile-rows", 700, "--dry-run", "--json", "-")
+    told = json.loads(succeeds(command_line, tmp_path, *words).out)
+    assert (told["rows"], told["tiles"]) == (1600, 3)
+    written = sum(path.stat().st_size for path in (place / "tiles").glob("*.f32"))
+    assert written < told["disk"] < 4 * written
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_step_that_was_cut_is_done_again(place: Path, tmp_path: Path) -> None:
@@ -214,11 +237,11 @@ def test_tiles_are_not_too_many(place: Path, tmp_path: Path, monkeypatch: pytest
 
 def test_several_whole_options_are_named_together(command_line: CommandLine, place: Path) -> None:
     ask = ("distill", "-r", "10", "-o", "x", "--views", "views.json")
-    told = refused(command_line, place, *ask, "tiles", "--clean", "--photos", status=1)
-    assert "tiles: --clean and --photos need the whole scene in memory" in told
+    told = refused(command_line, place, *ask, "tiles", "--clean", "--method", "fast", status=1)
+    assert "tiles: --method fast and --clean need the whole scene in memory" in told
     assert "use `g2ard ingest tiles -o DIR --tile-rows 1,600` for one piece" in told
     assert needs_whole(DistillOptions().config) == []
-    assert needs_whole(DistillOptions(settings={"engine": "torch"}).config) == ["--engine"]
+    assert needs_whole(DistillOptions(settings={"schedule": "paper"}).config) == ["--schedule paper"]
 
 
 def test_rows_of_tiles_that_lie_in_a_folder_are_theirs(command_line: CommandLine, place: Path) -> None:

@@ -167,7 +167,7 @@ def test_rows_that_no_view_sees_are_counted(tmp_path: Path) -> None:
     with executor() as runs:
         done = simplify_tiles(TiledRun(tiles, Workers(runs, tmp_path), SimplifyConfig()), 900, views)
     unseen = np.count_nonzero(visibility_source(views)(scene).weight == 0)
-    assert done.unseen == pytest.approx(unseen, rel=0.02)
+    assert done.report.unseen == pytest.approx(unseen, rel=0.02)
     assert len(scene) / 2 < unseen < len(scene)
 
 
@@ -369,9 +369,9 @@ def test_a_floor_in_tiles_stays_as_closed_as_in_one_piece(tmp_path: Path, seen: 
     lost = [opacity_lost(lifted, small, ring()) for small in (whole.splats, measured.splats.whole())]
     assert lost[1] == pytest.approx(lost[0], abs=0.02)
     if seen:
-        assert measured.opacity_lost == pytest.approx(lost[1], abs=0.03)
+        assert measured.report.opacity_lost == pytest.approx(lost[1], abs=0.03)
     else:
-        assert measured.opacity_lost is None
-    assert tiled(SimplifyConfig(), gaps=False).opacity_lost is None
+        assert measured.report.opacity_lost is None
+    assert tiled(SimplifyConfig(), gaps=False).report.opacity_lost is None
     little = tiled(SimplifyConfig(max_growth=1), gaps=False)
     assert opacity_lost(lifted, little.splats.whole(), ring()) > lost[1] + 0.02

@@ -42,6 +42,7 @@ def distill(
             help="A trained scene or coloured point cloud. Omit it to start from the photos of --views.",
         ),
     ] = None,
+    others: opt.OthersArgument = None,
     views: opt.ViewsOrMadeOption = None,
     images: opt.ImagesOption = None,
     alpha: opt.AlphaOption = "composite",
@@ -104,7 +105,7 @@ def distill(
     opt.check_engine(settings.get("recover.engine"))
     refuse_file(output, f"the scene in it is scene.{format}")
     run.claim("--output", output, folder=True)
-    source = None if scene is None else Source(scene, run.render_model)
+    source = None if scene is None else Source(scene, run.render_model, others or ())
     folder = RunFolder(run, output, f"scene.{format}", resume)
     if not dry_run and (finished := folder.check(budget)):
         drop_work(tiling_of(run, source, output))
@@ -129,9 +130,7 @@ def distill(
     tiling = tiling_of(run, source, output)
     how = tiling if source is not None and is_tiled(source, tiling) else None
     if source is not None and budget is not None and how is not None:
-        whole = needs_whole(options.config, preset, [budget], f"scene.{format}", clean=clean, photos=photos)
-        whole += [] if time is None else [f"--time {time:g}"]
-        refuse_whole(source, whole)
+        refuse_whole(source, needs_whole(options.config, preset, clean=clean))
     elif scene is not None and budget is not None:
         say_fit(run, scene, budget, f"scene.{format}")
     written = None if dry_run else how
@@ -139,7 +138,7 @@ def distill(
     with held, preparing(source, budget, options, how, planned=dry_run, **run.callbacks) as job:
         cost = cost_of(job, job.budget.count, page=page)
         if dry_run:
-            tell_plan(run, job.budget.count, cost, job.tiles)
+            tell_plan(run, job.budget.count, cost, job.plan)
             return
         check_job_memory(job, tiling.memory, cost.bytes)
         run.console.expect(cost.stages)

@@ -93,9 +93,8 @@ def _described(given: ViewFiles) -> tuple[dict[str, Any], list[list[str]]]:
     figures["run"] = {"input_count": report["input_count"], "against": against, "scores": scores}
     photos, one = report.get("photos"), "point" if report.get("lifted") else "Gaussian"
     rows = [["made from", plural(photos, "photo") if photos else plural(report["input_count"], one)]]
-    if "overdraw" in report:  # not of runs in tiles
-        figures["run"]["overdraw"] = report["overdraw"]
-        rows.append(["Gaussians per pixel, held-out", f"{report['overdraw']:.1f}"])
+    figures["run"]["overdraw"] = report["overdraw"]
+    rows.append(["Gaussians per pixel, held-out", f"{report['overdraw']:.1f}"])
     words = {"simplified": "start" if photos else "simplified", "recovered": RESULT}
     for name, found in scores.items():
         ssim = f", SSIM {found['ssim']:.4f}" if "ssim" in found else ""
@@ -116,14 +115,9 @@ def _overdraw(splats: Splats) -> dict[str, Any]:
 
 
 def _scores(report: dict[str, Any]) -> tuple[str, dict[str, dict[str, float]]]:
-    """Return the name of a run's targets and its scores; tiled runs have only PSNR."""
-    from g2ard.rendering.targets import RENDERS
-
-    scores = report["scores"]
-    if "tiles" in report:
-        return RENDERS, {name: {"psnr": scores[name]} for name in ("simplified", "recovered")}
+    """Return the name of a run's targets and its scores."""
     return report["against"], {
-        name: {k: found[k] for k in ("psnr", "ssim")} for name, found in scores.items()
+        name: {k: found[k] for k in ("psnr", "ssim")} for name, found in report["scores"].items()
     }
 
 
@@ -174,6 +168,8 @@ def _rows(figures: dict[str, Any]) -> list[list[str]]:
         rows.append(["render model", figures["render_model"]])
     if any(figures.get("offset", ())):
         rows.append(["offset", _vector(figures["offset"])])
+    if "map_system" in figures:
+        rows.append(["map system", figures["map_system"]])
     extent = figures["extent"]
     rows.append(["extent", f"{_vector(extent['min'])} … {_vector(extent['max'])}"])
     rows.append(["1 % to 99 %", f"{_vector(extent['robust_min'])} … {_vector(extent['robust_max'])}"])

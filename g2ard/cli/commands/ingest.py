@@ -1,17 +1,23 @@
 """`g2ard ingest`: a scene of any size → tiles."""
 
+from __future__ import annotations
+
 import time
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from g2ard.cli import options as opt
 from g2ard.cli.budget_options import Count
 from g2ard.cli.command import command
 from g2ard.cli.outputs import refuse_file
 from g2ard.cli.run import Run
 from g2ard.progress import plural
 from g2ard.system.peak_memory import peak_rss
+
+if TYPE_CHECKING:
+    from g2ard.io import Source
 
 
 @command(
@@ -26,6 +32,7 @@ def ingest(
     scenes: Annotated[
         list[Path], typer.Argument(metavar="SCENE…", help="Scenes to join, or coloured point clouds to lift.")
     ],
+    *,
     output: Annotated[
         Path, typer.Option("-o", "--output", metavar="DIR", help="Output folder for the tiles.")
     ],
@@ -35,12 +42,17 @@ def ingest(
             parser=Count.parse_absolute, metavar="COUNT", help="Maximum Gaussians per tile; 5M by default."
         ),
     ] = None,
+    dry_run: opt.DryRunOption = False,
 ) -> None:
     """Split a scene of any size into tiles."""
+    from g2ard.io import Source
     from g2ard.stages.lift import LiftConfig
     from g2ard.tiles.ingest import TILE_ROWS
     from g2ard.tiles.ingest import ingest as into_tiles
 
+    if dry_run:
+        _tell_plan(run, Source(scenes[0], run.render_model, scenes[1:]), tile_rows)
+        return
     refuse_file(output, "tiles")
     run.claim("--output", output, folder=True)
     began = time.perf_counter()
@@ -79,3 +91,18 @@ def ingest(
             "peak_rss": peak_rss(),
         }
     )
+
+
+def _tell_plan(run: Run, source: Source, tile_rows: Count | None) -> None:
+    """Print the number of tiles, and the rough memory and disk that writing them takes."""
+    from g2ard.jobs.memory import plan_tiles
+    from g2ard.jobs.tile_options import Tiling
+
+    stream = source.cloud() if source.kind == "points" else source.scene
+    plan = plan_tiles(stream, Tiling(None if tile_rows is None else int(tile_rows.value), workers=1))
+    run.answer(
+        f"{plan.count:,} rows in {plural(plan.tiles, 'tile')}: roughly {plan.bytes / 1e6:,.0f} MB, and "
+        f"{plan.disk / 1e6:,.0f} MB of disk"
+    )
+    run.say_dry()
+    run.result({"rows": plan.count, "tiles": plan.tiles, "bytes": plan.bytes, "disk": plan.disk})

@@ -36,6 +36,8 @@ def lod(
             metavar="SCENE", help="A trained scene of any format, or a folder of tiles (`g2ard ingest`)."
         ),
     ],
+    others: opt.OthersArgument = None,
+    *,
     output: Annotated[
         Path,
         typer.Option(
@@ -131,7 +133,6 @@ def lod(
     from g2ard.jobs.inputs import GivenViews
     from g2ard.jobs.levels import (
         check_ratios,
-        check_trained,
         preparing_levels,
         save_tileset,
         tileset_up,
@@ -144,8 +145,7 @@ def lod(
     from g2ard.system.peak_memory import peak_rss_of_all
 
     refuse_file(output, "levels of detail")
-    source = Source(scene, run.render_model)
-    check_trained(source)
+    source = Source(scene, run.render_model, others or ())
     if not recover:
         run.refuse_typed("with --merge-only", "steps")
     with run.usage():
@@ -205,7 +205,7 @@ def lod(
         levels = job.run(stopped)
         begun = None  # folder for files of these levels that are begun
         if tiled:
-            content = [[one.key for one in levels.splats], asdict(rule)]
+            content = [[getattr(one, "key", one) for one in levels.splats], asdict(rule)]
             begun = tiling.folder / f"written-{key_of(content)}"
             begun.mkdir(exist_ok=True)
         run.begin("write")

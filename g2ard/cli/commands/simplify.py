@@ -13,7 +13,7 @@ from g2ard.cli import options as opt
 from g2ard.cli.command import command
 from g2ard.cli.outputs import Outputs, budgets_of
 from g2ard.cli.run import Run
-from g2ard.cli.run_result import say_fit, say_weight, tell_quality, tiles_of
+from g2ard.cli.run_result import memory_of, say_fit, say_weight, tell_quality, tiles_of
 from g2ard.cli.work_folder import tiling_of, work_folder
 from g2ard.config.choices import is_made
 from g2ard.config.schema import listed
@@ -44,6 +44,7 @@ def simplify(
     run: Run,
     *,
     scene: opt.SceneArgument,
+    others: opt.OthersArgument = None,
     views: opt.ViewsOrMadeOption = None,
     images: opt.ImagesOption = None,
     no_views: Annotated[
@@ -84,7 +85,7 @@ def simplify(
     given_views = views is not None and not is_made(views)
     if given_views or no_views or config.method == "paper" or (config.method == "fast" and views is None):
         run.refuse_typed("without generated views", "up")
-    source = Source(scene, run.render_model)
+    source = Source(scene, run.render_model, others or ())
     tiling = tiling_of(run, source, output)
     given = opt.with_images(views, images)
     name = "scene.ply" if output == opt.UNWRITTEN else output.name
@@ -93,7 +94,7 @@ def simplify(
         outputs.check()
     how, maps = tiling if is_tiled(source, tiling) else None, None
     if how is not None:
-        refuse_whole(source, needs_whole(config, preset, budgets, name, parents=parents))
+        refuse_whole(source, needs_whole(config, preset, parents=parents))
     else:
         say_fit(run, scene, budgets[0], name)
         if source.kind != "points":
@@ -176,10 +177,10 @@ def _tell_plan(run: Run, reduce: Reduction, counts: Sequence[int]) -> None:
         cost = cost_of_reduction(reduce, count)
         run.answer(
             f"{plural(count, 'Gaussian')}, weighed in {plural(cost.views, 'view')}: roughly "
-            f"{max(1, cost.seconds):.0f} s on two cores and {cost.bytes / 1e6:,.0f} MB"
+            f"{max(1, cost.seconds):.0f} s on two cores and {memory_of(cost)}"
         )
         told: dict[str, Any] = {"count": count, "views": cost.views, "stages": cost.stages}
-        plans.append({**told, "bytes": cost.bytes, "seconds": cost.seconds, **tiles_of(reduce.tiles)})
+        plans.append({**told, "bytes": cost.bytes, "seconds": cost.seconds, **tiles_of(reduce.plan)})
     run.say_dry()
     run.results(plans)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 import numpy as np
+from numpy.typing import NDArray
 
 from g2ard.progress import Say
 from g2ard.rendering.renderer import RasterSettings, Renderer, settings_for
@@ -45,15 +46,23 @@ def light_lost(
     before, after = (Renderer(scene, settings=settings) for scene in (dense, result))
 
     def lost(view: Camera) -> tuple[float, float]:
-        stopped, now = before.render(view).alpha, after.render(view).alpha
-        there = stopped > _OPAQUE
-        misses = np.maximum(stopped - now, 0)[there]
-        return float(misses.sum(dtype=np.float64)), float(stopped[there].sum(dtype=np.float64))
+        return let_through(before.render(view).alpha, after.render(view).alpha)
 
     through = opaque = 0.0
     for misses, stops in in_threads(lost, list(views)):
         through, opaque = through + misses, opaque + stops
     return through, opaque
+
+
+def let_through(stopped: NDArray[np.float32], now: NDArray[np.float32]) -> tuple[float, float]:
+    """Return what `light_lost` sums, of one view.
+
+    Args:
+        stopped, now: (H, W) alpha of the dense scene and of the result.
+    """
+    there = stopped > _OPAQUE
+    misses = np.maximum(stopped - now, 0)[there]
+    return float(misses.sum(dtype=np.float64)), float(stopped[there].sum(dtype=np.float64))
 
 
 def opacity_lost(dense: Splats, result: Splats, cameras: Cameras) -> float:

@@ -28,7 +28,7 @@ _OPACITY_FIT_LIMITS = (0.5, 2.0)
 _OPACITY_FIT_FLOOR = 0.05
 """Share of the mean added to both sides of the ratio, so that hardly visible rows stay unchanged."""
 
-_MANY = 20
+MANY = 20
 """Mean number of members from which `default` fits colours: fewer share about one colour, and a fit to some
 views loses in others as much as it gains (decision 0009)."""
 
@@ -109,7 +109,7 @@ def merge_and_fit(
     changed = fitted.logit_opacities != merged.logit_opacities
     changed |= (fitted.scales != merged.scales).any(axis=1)
     views = getattr(source, "views", None)
-    if views is not None and isinstance(config, Default) and len(scene) >= _MANY * budget:
+    if views is not None and isinstance(config, Default) and len(scene) >= MANY * budget:
         fitted = recoloured(scene.take(order), fitted, views, progress)
     return {
         **out,

@@ -72,6 +72,7 @@ class SimplifyReport(Report):
         skipped: `alone`: unmerged rows; `sh_bands`: bands of zeros, not computed; for `paper`, `coverages`:
             groups already rejected by the cheaper guard, and rounds that needed no `binnings` or `trims`.
         seconds: in the pipeline, time of the stage including visibility.
+        tiles: rows of each tile, for a scene in tiles; `fitted` and `faded` are not counted there.
     """
 
     input_count: int
@@ -88,6 +89,7 @@ class SimplifyReport(Report):
     skipped: dict[str, int]
     opacity_lost: float | None = field(default=None, metadata=LEFT_OUT)
     seconds: float | None = field(default=None, metadata=LEFT_OUT)
+    tiles: list[int] | None = field(default=None, metadata=LEFT_OUT)
 
 
 _DEFAULTS = SimplifyConfig()

@@ -1,0 +1,131 @@
+"""The dense scene that a command works on: in memory, or streamed into tiles if it is large."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from g2ard.errors import InputError
+from g2ard.io.sanitize import BLOCK
+from g2ard.io.source import Source
+from g2ard.io.stream import PointStream, SceneStream
+from g2ard.io.types import Note
+from g2ard.jobs.memory import TilePlan, plan_tiles
+from g2ard.jobs.tile_options import Tiling
+from g2ard.pipeline.dense import Dense, InMemory
+from g2ard.progress import Progress, Say, silent, unsaid
+from g2ard.scene.splats import Splats
+from g2ard.scene.transform import join
+from g2ard.stages.lift import LiftConfig, lift
+from g2ard.stages.simplify import SimplifyConfig
+from g2ard.tiles.simplify import sample_stride
+
+if TYPE_CHECKING:
+    from g2ard.io.tile_store import TileStore
+
+
+@dataclass(eq=False)
+class Planned(InMemory):
+    """A scene in tiles that are only planned: a sample, and the number of all its Gaussians."""
+
+    count: int = 0
+
+    @property
+    def total(self) -> int:
+        """Number of Gaussians."""
+        return self.count
+
+
+@dataclass(frozen=True, eq=False)
+class Opened:
+    """A dense scene in tiles.
+
+    Args:
+        plan: of its tiles.
+        notes: on its file, once it has been read.
+    """
+
+    dense: Dense
+    plan: TilePlan
+    notes: tuple[Note, ...] = ()
+
+
+@contextmanager
+def opened(
+    source: Source,
+    tiling: Tiling,
+    times: float,
+    config: SimplifyConfig,
+    lifting: LiftConfig | None = None,
+    *,
+    planned: bool = False,
+    progress: Progress = silent,
+    say: Say = unsaid,
+) -> Iterator[Opened]:
+    """Open the tiles of a scene, streamed into `tiling.folder` if it is a file, and start workers.
+
+    Args:
+        source: a scene, a point cloud, which is lifted tile by tile, or tiles.
+        tiling: how. Tiles of another size are replaced unless the user named the folder.
+        times: memory of a tile relative to merging it.
+        config: of merges.
+        lifting: how points are lifted.
+        planned: only plan this; nothing is written.
+    """
+    from g2ard.tiles.dense import InTiles
+    from g2ard.tiles.executor import Workers, executor
+    from g2ard.tiles.ingest import ingest
+
+    store = source.store if source.kind == "splats" else None
+    _check_model(source, store)
+    if store is None and not planned:
+        store = ingest(
+            source,
+            tiling.folder / "tiles",
+            tile_rows=tiling.most_rows,
+            lift=lifting,
+            overwrite=not tiling.keep,
+            progress=progress,
+            say=say,
+        )
+    stream = source.scene if source.kind == "splats" else source.cloud()
+    plan = plan_tiles(store or stream, tiling, times)
+    say(f"{plan.tiles:,} tiles of {plan.count:,} Gaussians, {plan.workers} at a time")
+    if planned or store is None:
+        yield Opened(Planned(_sampled(stream, lifting), count=plan.count), plan)
+        return
+    threads = max(1, tiling.usable_cores // plan.workers)
+    with executor(plan.workers, threads, tiling.scheduler) as runs:
+        workers = Workers(runs, tiling.folder / "steps", progress)
+        yield Opened(InTiles(store, workers, config, tiling.most_rows, tiling.folder), plan, store.notes)
+
+
+def _check_model(source: Source, store: TileStore | None) -> None:
+    model = source.render_model
+    if store is not None and model not in (None, store.render_model):
+        raise InputError(
+            f"these tiles are {store.render_model}",
+            path=source.path,
+            hint=f"run `g2ard ingest --render-model {model}` on their scene",
+        )
+
+
+def _sampled(stream: SceneStream | PointStream, lifting: LiftConfig | None) -> Splats:
+    """Return a sample of a scene or of a lifted cloud that is not in tiles yet."""
+    stride, read, scenes, points = sample_stride(stream.count), 0, [], []
+    for block in stream.blocks(BLOCK):
+        rows = slice(-read % stride, None, stride)
+        if isinstance(block, Splats):
+            scenes.append(block.take(rows))
+            read += len(block)
+        else:
+            points.append((block[0][rows], block[1][rows]))
+            read += len(block[0])
+    if scenes:
+        return join(scenes)
+    positions, colors = (np.concatenate(part) for part in zip(*points, strict=True))
+    return lift(positions, colors, **vars(lifting or LiftConfig()))

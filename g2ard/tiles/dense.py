@@ -1,0 +1,219 @@
+"""A dense scene in tiles: what a run asks of it (`g2ard.pipeline.dense`), computed tile by tile."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from g2ard.config.choices import BLACK, Colour
+from g2ard.io.stream import PartsStream
+from g2ard.io.tile_store import TileStore
+from g2ard.pipeline.dense import InMemory
+from g2ard.progress import Progress, silent
+from g2ard.rendering.boxes import front_to_back
+from g2ard.rendering.recolour import seen_by, shifted
+from g2ard.rendering.renderer import RasterSettings, Renderer, settings_for
+from g2ard.rendering.targets import Cached, Targets, unrounded
+from g2ard.rendering.visibility import LONGEST
+from g2ard.scene.cameras import Cameras
+from g2ard.scene.splats import Splats
+from g2ard.stages.simplify import SimplifyConfig
+from g2ard.stages.simplify.gaps import let_through, some_views
+from g2ard.stages.simplify.pairs import MANY
+from g2ard.stages.simplify.reduce import SimplifyReport
+from g2ard.system.cached import cached_property
+from g2ard.tiles.executor import Workers
+from g2ard.tiles.ingest import ingest
+from g2ard.tiles.merging import simplify_tiles
+from g2ard.tiles.sights import written
+from g2ard.tiles.simplify import TiledRun
+from g2ard.tiles.tasks import Task, load
+
+_VIEWS_PER_TASK = 32
+"""Views that a task draws together, so that a tile is read once for them."""
+
+_KEPT_BYTES = 500_000_000
+"""Bytes of images kept in memory; further ones are read from their file again on each access."""
+
+
+@dataclass(frozen=True, eq=False)
+class MergedTiles:
+    """A scene merged in tiles, and a report."""
+
+    splats: Splats | PartsStream
+    report: SimplifyReport
+    protected: NDArray[np.bool_] | None = None
+
+
+@dataclass(eq=False)
+class InTiles:
+    """A dense scene in tiles.
+
+    Args:
+        workers: what computes, and the folder of its files.
+        config: of its merges.
+        most_rows: a scene that is merged to at most so many Gaussians is in memory.
+        folder: for tiles of scenes that are derived from this one.
+    """
+
+    store: TileStore
+    workers: Workers
+    config: SimplifyConfig
+    most_rows: int
+    folder: Path
+
+    @property
+    def total(self) -> int:
+        """Number of Gaussians."""
+        return self.store.count
+
+    @cached_property
+    def sample(self) -> Splats:
+        """A sample of the Gaussians, from all tiles."""
+        return replace(self._run.sample(), up=self.store.up, axes=self.store.axes)
+
+    @cached_property
+    def _run(self) -> TiledRun:
+        return TiledRun(self.store, self.workers, self.config)
+
+    @cached_property
+    def settings(self) -> RasterSettings:
+        """Conventions of its images."""
+        return settings_for(self.sample.means, antialiased=self.sample.antialiased)
+
+    @cached_property
+    def wide(self) -> list[Path]:
+        """Files of the Gaussians of each tile that reach far, see `g2ard.tiles.images`."""
+        return self._run.each("wide", "wide", module="g2ard.tiles.images")
+
+    def identity(self) -> list[str]:
+        """Return the key of the tiles."""
+        return [self.store.key]
+
+    def merged(
+        self,
+        count: int,
+        views: Cameras | None,
+        config: SimplifyConfig,
+        *,
+        protected: NDArray[np.bool_] | None = None,
+        final_budget: int | None = None,
+        gaps: bool = False,
+        progress: Progress = silent,
+    ) -> MergedTiles:
+        """Merge the scene, see `Dense`; finished steps are in the folder of the workers.
+
+        `protected` and `final_budget` serve the method `paper`, which needs the whole scene in memory.
+        """
+        done = simplify_tiles(self._run, count, views, gaps=gaps)
+        splats: Splats | PartsStream = done.splats
+        if views is not None and self.total >= MANY * count and count <= self.most_rows:
+            splats = self._recoloured(done.splats.whole(), views, progress)
+        return MergedTiles(splats, done.report)
+
+    def _recoloured(self, small: Splats, views: Cameras, progress: Progress) -> Splats:
+        chosen = seen_by(views.resized(LONGEST))
+        drawn = TileRenders(self, chosen, opacity=True)
+
+        def shown(view: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+            image = drawn[view]
+            return image[..., :3], image[..., 3]
+
+        drawn.fill(progress)
+        return shifted(small, chosen, shown, self.settings, progress)
+
+    def images(self, views: Cameras, background: Colour = BLACK) -> Targets:
+        """Return the scene's images in some views."""
+        return TileRenders(self, views, background)
+
+    def opacity_lost(self, result: Splats, views: Cameras) -> float:
+        """Return the share of light that a result lets through."""
+        some = some_views(views)
+        drawn, renderer = TileRenders(self, some, opacity=True), Renderer(result, settings=self.settings)
+        pairs = [
+            let_through(drawn[view][..., 3], renderer.render(camera).alpha)
+            for view, camera in enumerate(some)
+        ]
+        lost, opaque = np.sum(pairs, axis=0)
+        return float(lost / opaque) if opaque else 0.0
+
+    def derived(self, scene: Splats | PartsStream, name: str) -> InMemory | InTiles:
+        """Return a scene that was derived from this one: in memory, or in tiles of its own if it is large."""
+        if isinstance(scene, Splats):
+            return InMemory(scene)
+        if len(scene) <= self.most_rows:
+            return InMemory(scene.whole())
+        folder = self.folder / f"{name}-{scene.identity()[0]}"
+        store = ingest(scene, folder, tile_rows=self.most_rows)
+        return InTiles(store, self.workers, self.config, self.most_rows, self.folder)
+
+
+class TileRenders(Cached):
+    """Renders of a scene in tiles, drawn by its workers; see `TeacherRenders`.
+
+    Args:
+        opacity: whether images are (H, W, 4), with alpha, and not limited to 1.
+    """
+
+    def __init__(
+        self, scene: InTiles, cameras: Cameras, background: Colour = BLACK, *, opacity: bool = False
+    ) -> None:
+        super().__init__(cameras, _KEPT_BYTES)
+        self._scene, self._background, self._opacity = scene, tuple(background), opacity
+        self._files: dict[int, Path] = {}
+
+    def _given(self) -> Sequence[Any]:
+        return [*self._scene.identity(), self._background, self._opacity]
+
+    def against(self, view: int) -> str:
+        """Return the kind, see `against_of`."""
+        return "teacher"
+
+    def fill(self, progress: Progress, views: Sequence[int] | None = None) -> None:
+        """Draw the views, all by default, that are not drawn yet."""
+        views = range(len(self.cameras)) if views is None else views
+        missing = [int(view) for view in views if view not in self._files]
+        if not missing:
+            return
+        store, workers = self._scene.store, self._scene.workers
+        shown = written(workers.folder, self.cameras)
+        positions = self.cameras.positions - store.offset
+        alike = sorted(missing, key=lambda view: front_to_back(store.tree, positions[view]))
+        chunks = math.ceil(len(alike) / _VIEWS_PER_TASK)
+        files = self._scene.wide
+        tasks = [
+            Task(
+                "g2ard.tiles.images:draw",
+                f"images-{number:05}",
+                workers.folder,
+                {
+                    "store": store.key,
+                    "views": [int(view) for view in chunk],
+                    "near": self._scene.settings.near_of(0),
+                    "background": list(self._background),
+                    "opacity": self._opacity,
+                },
+                {"views": shown, "wide": files},
+                {"store": store.folder},
+                len(chunk),
+            )
+            for number, chunk in enumerate(np.array_split(alike, chunks))
+        ]
+        for task, path in zip(tasks, workers.run(tasks, "targets"), strict=True):
+            self._files |= dict.fromkeys(task.arguments["views"], path)
+
+    def _make(self, view: int) -> NDArray[Any]:
+        if view not in self._files:
+            self.fill(self._scene.workers.progress)
+        (image,) = load(self._files[view], str(view))
+        return image
+
+    def __getitem__(self, view: int) -> NDArray[np.float32]:
+        image = self._stored(view)
+        return image if self._opacity else unrounded(image)
