@@ -19,6 +19,7 @@ from g2ard.stages.simplify import SimplifyConfig, simplify
 from g2ard.stages.simplify.gaps import opacity_lost
 from g2ard.stages.simplify.pairs import VisibilitySource
 from g2ard.stages.simplify.reduce import SimplifyReport
+from g2ard.system.keys import UNKEYED
 
 
 class Merged(Protocol):
@@ -80,7 +81,7 @@ class InMemory:
     """A dense scene in memory."""
 
     splats: Splats
-    _sources: dict[int, tuple[Cameras, VisibilitySource]] = field(default_factory=dict)
+    _sources: dict[int, tuple[Cameras, VisibilitySource]] = field(default_factory=dict, metadata=UNKEYED)
 
     @property
     def sample(self) -> Splats:

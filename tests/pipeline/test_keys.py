@@ -7,18 +7,18 @@ import math
 import os
 import pkgutil
 from collections.abc import Iterator
-from dataclasses import fields, is_dataclass, replace
+from dataclasses import dataclass, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
 import numpy as np
 import pytest
-from g2ard.tiles.recover import TileTargets
 
 import g2ard
 from g2ard.pipeline import distill, steps
 from g2ard.pipeline.config import DistillConfig
+from g2ard.pipeline.dense import InMemory
 from g2ard.progress import silent
 from g2ard.rendering import targets
 from g2ard.rendering.renderer import RasterSettings
@@ -32,6 +32,7 @@ from g2ard.stages.recover.config import RecoverConfig
 from g2ard.stages.recover.loop import Loop
 from g2ard.system.cached import cached_property
 from g2ard.system.keys import UNKEYED, key_of
+from g2ard.tiles.dense import TileRenders
 from g2ard.tiles.tasks import Task
 from helpers.scenes import around, checkered_ball
 from helpers.view_files import photo
@@ -43,8 +44,19 @@ IMAGES = list(np.random.default_rng(0).random((2, 24, 32, 3), np.float32))
 CONFIG = RecoverConfig(steps=3)
 EXPOSURES = {VIEWS.names[0]: np.eye(3, 4)}
 
+
+@dataclass(frozen=True)
+class Tiles:
+    """Stands for a scene in tiles, which is drawn nowhere here."""
+
+    name: str
+
+    def identity(self) -> list[str]:
+        return [self.name]
+
+
 KEYED: dict[type, tuple[Any, str]] = {
-    Splats: (BALL, "up"),
+    Splats: (BALL, "up axes"),
     Cameras: (VIEWS, "image_paths mask_paths source"),
     Task: (
         Task("a:b", "label", Path("work"), {"tile": 1, "levels": ["near"]}, {"own": Path("a.npz")}),
@@ -73,6 +85,10 @@ KEYED: dict[type, tuple[Any, str]] = {
         TeacherRenders(BALL, VIEWS, settings=RasterSettings(), lazy=True),
         "cameras _limit _kept _bytes _renderer",
     ),
+    TileRenders: (
+        TileRenders(Tiles("a"), VIEWS),  # type: ignore[arg-type]
+        "cameras _limit _kept _bytes _files",
+    ),
     Subset: (Subset(Photos(VIEWS, IMAGES), [1, 0]), "cameras _places"),
 }
 """An object of each class that has a key, and its attributes that do not count: what only messages and
@@ -84,7 +100,6 @@ PARTS = {
     targets.Exposed,
     PhotosOrRenders,
     PreparedScene,
-    TileTargets,
 }
 """Classes between those, or whose images are hashed."""
 
@@ -241,7 +256,7 @@ def test_every_input_of_a_step_changes_its_key() -> None:
 def test_every_input_of_a_simplification_changes_its_key() -> None:
     given = {
         "number": 1,
-        "scene": BALL,
+        "dense": InMemory(BALL),
         "count": 20,
         "budget": 10,
         "cameras": VIEWS,
