@@ -7,7 +7,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from g2ard.jobs.photo_colors import median_colors
+from g2ard.io.types import Points
+from g2ard.jobs.distill import _points
+from g2ard.jobs.photo_colors import colored, median_colors
+from g2ard.progress import unsaid
 from g2ard.scene.cameras import Camera, Cameras
 
 
@@ -40,3 +43,19 @@ def test_each_side_has_the_median_colour_of_its_own_photos(tmp_path: Path, seed:
         assert seen[near].mean() > 0.9
         assert right[seen[near]].mean() > 0.95
     assert not seen[-1]
+
+
+def test_black_points_are_those_without_a_colour(tmp_path: Path) -> None:
+    """White ones have one, and black ones that no photo sees take the usual colour."""
+    views = [
+        view(tmp_path, row, (200, 40, 10), [x, -4.0, 0.1]) for row, x in enumerate((-0.3, 0.0, 0.3, 0.1))
+    ]
+    rng = np.random.default_rng(0)
+    positions = np.concatenate([rng.uniform(-1, 1, (900, 3)) * (1, 0, 1), [[0, 50.0, 0], [0.05, 0, 0.05]]])
+    colors = np.zeros((902, 3), np.float32)
+    colors[-1] = 1
+    cloud, _, _ = _points(Points(positions, colors), Cameras.of(views), unsaid)
+    assert cloud is not None
+    found = colored(cloud, Cameras.of(views), "cloud", say=unsaid).colors
+    np.testing.assert_array_equal(found[-1], 1)
+    np.testing.assert_allclose(found[:-1], np.tile(np.divide((200, 40, 10), 255), (901, 1)), atol=1e-3)

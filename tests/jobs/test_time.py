@@ -15,8 +15,12 @@ from g2ard.jobs.budget import Budget
 from g2ard.jobs.cost import cost_of
 from g2ard.jobs.distill import prepare
 from g2ard.jobs.distill_options import DistillOptions
+from g2ard.rendering.targets import TeacherRenders
+from g2ard.stages.recover.config import RecoverConfig
+from g2ard.stages.recover.loop import Loop
+from g2ard.stages.recover.optimize import recover
 from helpers.commands import CommandLine, succeeds
-from helpers.scenes import checkered_ball
+from helpers.scenes import around, checkered_ball
 
 
 @pytest.fixture(scope="module")
@@ -105,3 +109,12 @@ def test_a_dry_run_plans_the_time_that_is_given(
 def test_recovery_is_expected_to_get_its_least_share(job: jobs.DistillJob) -> None:
     """As it does, see `test_too_short_a_time_is_told`."""
     assert dict(cost_of(replace(job, time=0.5), 150).stages)["recover"] == pytest.approx(0.025)
+
+
+def test_the_time_of_trials_is_not_taken_from_the_steps(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Loop, "choose_rates", lambda self, start: setattr(self, "seconds", 5.0))
+    ball, views = checkered_ball(100), around(4, (24, 18))
+    config = RecoverConfig(recovery_time=9.0)
+    done = recover(ball.take(slice(50)), TeacherRenders(ball, views), config, time_left=lambda: 0.3)
+    assert done.report.steps > 0
+    assert 5.3 <= done.report.seconds < 8

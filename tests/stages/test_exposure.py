@@ -13,6 +13,7 @@ from g2ard.rendering.targets import Exposed, Photos, PhotosOrRenders
 from g2ard.scene.cameras import Cameras
 from g2ard.stages.evaluate import evaluate
 from g2ard.stages.recover.config import RecoverConfig
+from g2ard.stages.recover.engine import FusedEngine
 from g2ard.stages.recover.optimize import recover
 from helpers.commands import CommandLine, succeeds
 from helpers.photos import photographed
@@ -153,3 +154,53 @@ def test_gains_that_hardly_differ_are_not_fitted(gain: float, differ: bool) -> N
     images = [renderer.clipped(camera) * gain ** (row % 2) for row, camera in enumerate(views)]
     found = exposures_of(scene, Photos(views, images), (0.0, 0.0, 0.0))
     assert (found is not None) == differ
+
+
+def test_exposures_that_explain_little_of_the_error_are_not_fitted() -> None:
+    """However much they differ: here each pixel is wrong by far more."""
+    scene, rng = BALL.with_sh_degree(0), np.random.default_rng(0)
+    images = [
+        np.clip(g2ard.Renderer(scene).clipped(camera) * 0.6 * (0.75 + 0.5 * (row % 2)) + noise, 0, 1)
+        for row, camera in enumerate(VIEWS)
+        for noise in [rng.uniform(0, 0.4, (36, 48, 3)).astype(np.float32)]
+    ]
+    assert exposures_of(scene, Photos(VIEWS, images), (0, 0, 0), decided=True) is not None
+    assert exposures_of(scene, Photos(VIEWS, images), (0, 0, 0)) is None
+
+
+def test_masked_pixels_have_no_exposure() -> None:
+    """Targets of other classes may show something there."""
+
+    class Masked:
+        cameras = VIEWS
+
+        def __getitem__(self, view: int) -> Any:
+            image = RENDERS[view] * np.float32(0.5)
+            image[:, ::2] = RENDERS[view][:, ::2] * (0.3 + 0.3 * (view % 3))
+            return image
+
+        def mask(self, view: int) -> Any:
+            return np.broadcast_to(np.arange(48) % 2 == 1, (36, 48))
+
+        def against(self, view: int) -> str:
+            return "photo"
+
+    found = exposures_of(BALL.with_sh_degree(0), Masked(), (0, 0, 0), decided=True)
+    assert found is not None
+    np.testing.assert_allclose(found[..., 0], 1, atol=0.05)
+
+
+def test_a_target_that_a_device_may_keep_never_changes(monkeypatch: pytest.MonkeyPatch) -> None:
+    step, kept = FusedEngine.step, dict[int, Any]()
+    changing = []
+
+    def watched(self: FusedEngine, view: int, target: Any, *more: Any, **named: Any) -> float:
+        if named["fixed"]:
+            np.testing.assert_array_equal(kept.setdefault(view, np.array(target)), target)
+        changing.append(not named["fixed"])
+        return step(self, view, target, *more, **named)
+
+    monkeypatch.setattr(FusedEngine, "step", watched)
+    assert recover(start(), photos(KINDS["exposure"]), RecoverConfig(steps=100)).report.exposure is not None
+    assert not changing[0]
+    assert changing[-1]
