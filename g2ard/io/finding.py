@@ -12,11 +12,13 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from g2ard.io.types import Note
 
-_PHOTO_SUFFIXES = (".png", ".jpg", ".jpeg", ".jfif", ".webp", ".tif", ".tiff", ".bmp")
+_READ = ".png .jpg .jpeg .jpe .jfif .webp .tif .tiff .bmp .gif .ppm .pgm .pnm .tga .jp2"
+_PHOTO_SUFFIXES = tuple(_READ.split())
 
 _RAW = ".dng .cr2 .cr3 .nef .arw .raf .orf .rw2 .raw"
 _OTHER_PHOTOS = {
     **dict.fromkeys((".heic", ".heif", ".hif"), "HEIC"),
+    **dict.fromkeys((".avif", ".avifs"), "AVIF"),
     ".exr": "OpenEXR",
     ".hdr": "Radiance HDR",
     ".jxl": "JPEG XL",
@@ -32,7 +34,12 @@ _MISREAD_AS = ("cp437", "cp1252", "latin-1")
 """Character sets that programs take names for whose own is not stated, as in .zip files."""
 
 _MASK_FOLDERS = ("masks", "mask")
-_MASKS_BESIDE = ("{name}.mask", "{stem}.mask", "{name}_mask", "{stem}_mask", "{stem}-mask", "mask_{stem}")
+MOVING = "dynamic_mask_"
+"""How names of instant-ngp's masks begin, in which white is what moves."""
+_MASKS_BESIDE = (
+    *("{name}.mask", "{stem}.mask", "{name}_mask", "{stem}_mask", "{stem}-mask", "mask_{stem}"),
+    *(MOVING + "{stem}", MOVING + "{name}"),
+)
 _MASKS = ("{name}", "{stem}", *_MASKS_BESIDE)
 """Names of a photo's mask without its suffix: beside the photo, and in a folder of masks."""
 
@@ -131,11 +138,12 @@ class Finder:
         """Return the files and the folders of a folder by key; only photos have keys without suffix."""
         if folder not in self._listings:
             held = sorted(folder.iterdir(), reverse=True) if folder.is_dir() else []
+            held.sort(key=is_photo)  # those that can be read win over others of the same stem
             levels = [(path, _keys(path.name)) for path in held if path.is_dir() or usable(path)]
             files: dict[str, Path] = {}
             for depth in (3, 2, 1, 0):  # nearer spellings win
                 for path, keys in levels:
-                    if not path.is_dir() and (depth < 2 or is_photo(path)):
+                    if not path.is_dir() and (depth < 2 or is_a_photo(path)):
                         files |= dict.fromkeys(keys[depth], path)
             inner = {key: path for path, keys in levels if path.is_dir() for keys_ in keys for key in keys_}
             self._listings[folder] = files, inner

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import itertools
 import math
+import re
 import shutil
 import subprocess
+import sys
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -17,11 +19,12 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from PIL import Image, ImageDraw, ImageFont, ImageOps
+from PIL import Image, ImageCms, ImageDraw, ImageFont, ImageOps
 
 from g2ard.config.choices import BLACK, Colour
 from g2ard.errors import InputError, MissingDependencyError
 from g2ard.io.atomic import atomic_output
+from g2ard.io.finding import MOVING, files_in
 from g2ard.io.jsonfile import Place, Row, checked, read_json
 from g2ard.io.photos import fits, opened_image, photo_size, turns
 from g2ard.scene.cameras import Cameras
@@ -171,8 +174,9 @@ def exposure_file(photo: Path) -> Path:
 def load_mask(cameras: Cameras, index: int) -> NDArray[np.bool_] | None:
     """Read the (H, W) mask of a view's photo, in the pixels of `load_photo`; None if all count.
 
-    Pixels count that the photo holds and whose mask is brighter than half; for a photo that is its own mask,
-    those whose alpha is above half.
+    Pixels count that the photo holds and whose mask is brighter than half of its brightest pixel; for a photo
+    that is its own mask, and for a mask that is black all over, those whose alpha is above half. In a mask
+    of labels, every label above 0 counts. instant-ngp's `dynamic_mask_*` leaves out what is white.
     """
     return _mask(cameras, index, None)
 
@@ -186,11 +190,24 @@ def _mask(cameras: Cameras, index: int, image: NDArray[np.float32] | None) -> ND
         own = _image(cameras, index) if image is None else image
         mask = own[..., 3] > 0.5 if own.shape[2] == 4 else None
     else:
-        shown = _image(replace(cameras, image_paths=cameras.mask_paths), index)
-        mask = composited(shown, BLACK).mean(2) > 0.5
+        mask = _kept(_image(replace(cameras, image_paths=cameras.mask_paths), index))
+        mask = ~mask if path.name.lower().startswith(MOVING) else mask
     if mask is None or held is None:
         return held if mask is None else np.ascontiguousarray(mask)
     return np.ascontiguousarray(mask & held)
+
+
+_LABELS = 32 / 255  # brightest value below which the values of a mask are labels
+
+
+def _kept(mask: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """Return the pixels that a mask keeps."""
+    shade = composited(mask, BLACK).max(2)
+    if mask.shape[2] == 4 and not shade.any():
+        return mask[..., 3] > 0.5
+    top = float(shade.max())
+    kept: NDArray[np.bool_] = shade > 0.5 * (top if top >= _LABELS else min(top, 1 / 255))
+    return kept
 
 
 def _held(cameras: Cameras, index: int) -> NDArray[np.bool_] | None:
@@ -224,20 +241,95 @@ _WHOLE = 0.999  # share of a pixel above which it counts as whole
 
 
 def _open(path: Path, like: tuple[int, int] | None = None) -> NDArray[np.float32]:
-    """Decode a photo as (H, W, 3) RGB, or as premultiplied (H, W, 4) RGBA; for `like` see `turns`."""
+    """Decode a photo as (H, W, 3) sRGB, or as premultiplied (H, W, 4) RGBA; for `like` see `turns`."""
     with opened_image(path) as stored:
-        image = ImageOps.exif_transpose(stored) if turns(stored, like) else stored
-        if image.mode.startswith("I") or image.mode == "F":  # 16-bit grey has several modes
-            values = np.asarray(image, np.float32)
-            values = values / np.float32(1.0 if image.mode == "F" else 65535.0)
-            if not (values.min() >= 0 and values.max() <= 1):  # also NaN
-                raise InputError("expected values in [0, 1]", path=path)
-            return np.repeat(values[..., None], 3, axis=2)
-        if image.has_transparency_data:
-            rgba = np.asarray(image.convert("RGBA"), np.float32) / np.float32(255)
-            rgba[..., :3] *= rgba[..., 3:]
-            return rgba
-        return np.asarray(image.convert("RGB"), np.float32) / np.float32(255)
+        wide, upright = _is_deep(stored), turns(stored, like)
+        image = ImageOps.exif_transpose(stored) if upright else stored
+        if image.mode == "F":
+            values = np.asarray(image)[..., None]
+        elif wide:
+            words = _words(path, image, upright)
+            values = words / _white(path.parent, path.suffix, int(words.max()))
+        else:
+            values = np.asarray(_in_srgb(image), np.float32) / np.float32(255)
+    if not (values.min() >= 0 and values.max() <= 1):  # also NaN
+        text = f"expected values in [0, 1], found {values.min():g} to {values.max():g}"
+        raise InputError(text, path=path, hint="convert it to 8 bits")
+    values = np.repeat(values, 3 if values.shape[2] == 1 else 1, axis=2).astype(np.float32)
+    if values.shape[2] == 4:
+        values[..., :3] *= values[..., 3:]
+    return values
+
+
+def _is_deep(image: Image.Image) -> bool:
+    """Return whether an image that is not decoded yet has 16 bits per channel, and no colour profile."""
+    return image.mode.startswith("I") or (bool(_raw_mode(image)) and not image.info.get("icc_profile"))
+
+
+def _raw_mode(image: Any) -> str:
+    """Return what Pillow calls the 16-bit RGB or RGBA of an image; nothing for others."""
+    found = re.search("RGB[AX]?;16[BLN]", str(getattr(image, "tile", "")))
+    return found[0] if found else ""
+
+
+def _words(path: Path, image: Any, upright: bool) -> NDArray[Any]:
+    """Return the (H, W, C) values of 16 bits. Of colours, Pillow decodes the upper bytes; told that they are
+    of the other byte order, it decodes the lower ones."""
+    if image.mode.startswith("I"):
+        return np.asarray(image)[..., None]
+    with opened_image(path) as lower:
+        raw = _raw_mode(lower)
+        other = raw[:-1] + ("L" if raw[-1] == "B" or (raw[-1] == "N" and sys.byteorder == "big") else "B")
+        for i, tile in enumerate(tiles := lower.tile):  # type: ignore[attr-defined]
+            rest = () if isinstance(tile.args, str) else tile.args[1:]
+            tiles[i] = tile._replace(args=(other, *rest) if rest else other)
+        low = np.asarray(ImageOps.exif_transpose(lower) if upright else lower)
+    words = np.asarray(image).astype(np.uint16) * 256 + low
+    return words[..., :3] if image.mode == "RGBX" else words
+
+
+_BITS = (8, 10, 12, 14)  # bits of colours that are stored in 16
+
+
+def _white(folder: Path, suffix: str, brightest: int) -> float:
+    """Return the value of 16 bits that means white: the most of so many bits that holds the photos."""
+    top = _brightest(folder, suffix)
+    return float(next((2**bits - 1 for bits in _BITS if 0 < top < 2**bits > brightest), 65535))
+
+
+@lru_cache(maxsize=64)
+def _brightest(folder: Path, suffix: str) -> int:
+    """Return the brightest value of a few photos of 16 bits in a folder; 0 if each has one colour."""
+    files, found = files_in(folder, suffix.lower()), 0
+    for i in evenly_spaced(len(files), _BORDER_PHOTOS, floor=True):
+        with suppress(InputError, OSError), opened_image(files[i]) as image:
+            if _is_deep(image):
+                words = _words(files[i], image, False)[..., :3]
+                found = max(found, int(words.max()) if np.ptp(words) else 0)
+    return found
+
+
+def _in_srgb(image: Image.Image) -> Image.Image:
+    """Return an 8-bit image as RGB or RGBA, with its colour profile converted to sRGB."""
+    mode = "RGBA" if image.has_transparency_data else "RGB"
+    change = _conversion(image.info.get("icc_profile"), image.mode if image.mode in ("L", "CMYK") else mode)
+    if change is None:
+        return image.convert(mode)
+    own = image if image.mode in ("L", "CMYK") else image.convert(mode)
+    converted: Image.Image = change.apply(own)
+    return converted
+
+
+@lru_cache(maxsize=8)
+def _conversion(profile: bytes | None, mode: str) -> ImageCms.ImageCmsTransform | None:
+    """Return the conversion of a colour profile to sRGB; None if it is that, or cannot be used."""
+    with suppress(ImageCms.PyCMSError, ImportError, OSError, TypeError):
+        own = ImageCms.ImageCmsProfile(BytesIO(profile or b""))
+        if "srgb" not in ImageCms.getProfileDescription(own).lower():
+            goal = "RGBA" if mode == "RGBA" else "RGB"
+            colorimetric = ImageCms.Intent.RELATIVE_COLORIMETRIC
+            return ImageCms.buildTransform(own, ImageCms.createProfile("sRGB"), mode, goal, colorimetric)
+    return None
 
 
 def _undistorted(

@@ -141,9 +141,25 @@ def opened_image(path: Path, content: IO[bytes] | None = None) -> Iterator[Image
     except Image.DecompressionBombError as error:
         raise InputError(f"has more than {LARGEST_IMAGE:,} pixels", path=path) from error
     except UnidentifiedImageError as error:
+        if content is None and _begins(path, _TIFF):
+            raise InputError(_OTHER_TIFF, path=path, hint=_CONVERT_TIFF) from error
         raise InputError("is not an image", path=path) from error
     except Exception as error:  # Pillow's decoders raise any exception for damaged files
         raise damaged(f"cannot be decoded ({str(error) or type(error).__name__})", path=path) from error
+
+
+_TIFF = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
+_OTHER_TIFF = "is a TIFF of pixels that cannot be read, such as floats, or other bands than red, green, blue"
+_CONVERT_TIFF = (
+    "`gdal_translate -b 1 -b 2 -b 3 -ot Byte -scale IN.tif OUT.png` converts it, if these are its bands"
+)
+
+
+def _begins(path: Path, starts: tuple[bytes, ...]) -> bool:
+    """Return whether a file begins with one of some bytes; False if it cannot be read."""
+    with suppress(OSError), path.open("rb") as file:
+        return file.read(8).startswith(starts)
+    return False
 
 
 def photo_size(
@@ -394,10 +410,13 @@ def unreadable(photo: Path) -> str | None:
     """Return the format of a photo that cannot be read, by its suffix and first bytes, or None."""
     if (by_suffix := other_photo(photo)) is not None:
         return by_suffix
-    with suppress(OSError), photo.open("rb") as file:
-        if file.read(8).startswith(PHOTOS):
-            return None
-    sign = foreign(photo)
+    if _begins(photo, _TIFF):
+        try:
+            with opened_image(photo):
+                return None
+        except InputError as error:
+            return f"{error.message.removeprefix('is ')} ({error.hint})" if error.hint else None
+    sign = None if _begins(photo, PHOTOS) else foreign(photo)
     return None if sign is None else f"{sign.what} ({sign.todo})"
 
 
