@@ -11,64 +11,73 @@ from g2ard.errors import InputError
 from g2ard.io import judge
 from g2ard.io.plyfiles import (
     COLOR_NAMES,
+    is_mesh,
     read_element,
     read_header,
     require,
     row_blocks,
+    scene_names,
     spread_rows,
     write_rows,
 )
+from g2ard.io.signs import MESH
 from g2ard.io.stream import MarkedPoints, Names, PointStream, telling
 from g2ard.io.types import Points
 
 _POSITION = ["x", "y", "z"]
 
 
-_INTENSITIES = ("intensity", "reflectance", "reflectivity")
+_PACKED, _INTENSITIES = ("rgb", "rgba"), ("intensity", "reflectance", "reflectivity")
 
 
 class Stream(PointStream):
-    """Rows of x y z and red green blue, or intensity, of any type.
+    """Rows of x y z and red green blue, or a packed rgb, or intensity, of any type, in small letters or not.
 
     Text files and those with leading lists are read whole.
     """
 
     def __init__(self, path: Path) -> None:
-        header = read_header(path)
-        properties = header.properties("vertex")
-        require(path, properties, _POSITION, "a point cloud")
+        header, self.path = read_header(path), path
+        self._named = scene_names(header.properties("vertex"))
+        require(path, list(self._named), _POSITION, "a point cloud")
         (self._vertices,) = read_element(path, header, "vertex")
         rows = spread_rows(self._vertices)
-        choices = [names for names in COLOR_NAMES if set(names) <= set(properties)]
-        named = {word.lower().removeprefix("scalar_"): word for word in properties}
-        choices += [[named[word]] for word in _INTENSITIES if word in named]
+        choices = [names for names in COLOR_NAMES if set(names) <= set(self._named)]
+        choices += [[name] for name in (*_PACKED, *_INTENSITIES) if name in self._named]
+        kinds = {name: self._vertices.dtype[own] for name, own in self._named.items()}
+        choices = [names for names in choices if names[0] not in _PACKED or kinds[names[0]].itemsize == 4]
 
         def sampled(names: Names) -> MarkedPoints:
-            return _positions(rows), _colors(path, rows, names), np.zeros(len(rows), bool)
+            self._names = names
+            return self._marked(rows)
 
         self._names, sample = telling(map(tuple, choices), sampled)
-        kinds = [self._vertices.dtype[name] for name in self._names]
-        widest = max(map(judge.full_scales, kinds), key=lambda scales: scales[-1], default=(1.0,))
+        packed = self._names and self._names[0] in _PACKED
+        scales = [(255.0,)] if packed else [judge.full_scales(kinds[name]) for name in self._names]
+        widest = max(scales, key=lambda scales: scales[-1], default=(1.0,))
         super().__init__(path, len(self._vertices), sample, widest)
-        missing = ", ".join(repr(name) for name in COLOR_NAMES[0] if name not in properties)
-        if missing:
-            self.lack = f"a coloured point cloud needs the vertex property {missing}, or intensities"
+        if not choices:
+            found = f"(found {' '.join(header.properties('vertex'))})"
+            self.lack = "needs the vertex properties 'red', 'green', 'blue' of a coloured point cloud, or "
+            self.lack += f"intensities {found}; rename its colours if they have other names"
+        if not choices and is_mesh(header):
+            self.lack, self.todo = "is a mesh without colours at its vertices", MESH
 
     def raw(self, rows: int, start: int) -> Iterator[MarkedPoints]:
         for _, block in row_blocks(self.path, self._vertices, rows, start):
-            yield _positions(block), _colors(self.path, block, self._names), np.zeros(len(block), bool)
+            yield self._marked(block)
 
-
-def _positions(rows: NDArray[Any]) -> NDArray[np.float64]:
-    with np.errstate(invalid="ignore"):  # a signalling NaN
-        return np.stack([rows[name].astype(np.float64) for name in _POSITION], axis=1)
-
-
-def _colors(path: Path, rows: NDArray[Any], names: Names) -> NDArray[np.float32]:
-    """Return (n, 3) colours, (n, 1) intensities or (n, 0)."""
-    columns = [_color(path, rows[name], name) if len(names) == 3 else rows[name] for name in names]
-    with np.errstate(invalid="ignore", over="ignore"):
-        return np.stack([np.zeros(len(rows)), *columns], axis=1)[:, 1:].astype(np.float32)
+    def _marked(self, rows: NDArray[Any]) -> MarkedPoints:
+        """Return positions, (n, 3) colours, (n, 1) intensities or (n, 0), and that none is noise."""
+        columns = [rows[self._named[name]] for name in self._names]
+        if len(columns) == 3:
+            columns = [_color(self.path, c, name) for c, name in zip(columns, self._names, strict=True)]
+        elif columns and self._names[0] in _PACKED:
+            columns = judge.unpacked(columns[0])
+        noise = np.zeros(len(rows), bool)
+        with np.errstate(invalid="ignore", over="ignore"):  # a signalling NaN
+            positions = np.stack([rows[self._named[axis]].astype(np.float64) for axis in _POSITION], axis=1)
+            return positions, np.stack([noise, *columns], axis=1)[:, 1:].astype(np.float32), noise
 
 
 def _color(path: Path, values: NDArray[Any], name: str) -> NDArray[np.float32]:

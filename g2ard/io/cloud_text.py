@@ -3,7 +3,6 @@
 import io
 import re
 from collections.abc import Iterator
-from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -11,25 +10,26 @@ from numpy.typing import NDArray
 
 from g2ard.errors import InputError, damaged
 from g2ard.io import judge
-from g2ard.io.paths import plain_numbers, read_text
+from g2ard.io.paths import decoded, plain_numbers, read_text
 from g2ard.io.signs import is_table
 from g2ard.io.stream import MarkedPoints, PointStream
 
 _COLUMNS = {
-    "x": ("x", "easting"),
-    "y": ("y", "northing"),
-    "z": ("z", "height", "altitude"),
-    "red": ("red", "r"),
-    "green": ("green", "g"),
-    "blue": ("blue", "b"),
-    "intensity": ("intensity", "i", "reflectance", "scalar_intensity"),
+    "x": r"x|x_coord\w*|east\w*",
+    "y": r"y|y_coord\w*|north\w*",
+    "z": r"z|z_coord\w*|height|alt\w*|elev\w*",
+    "red": r"(scalar_|colou?r_|diffuse_)?r(ed|f)?",
+    "green": r"(scalar_|colou?r_|diffuse_)?g(reen|f)?",
+    "blue": r"(scalar_|colou?r_|diffuse_)?b(lue|f)?",
+    "rgb": r"rgba?",
+    "intensity": r"(scalar_)?(i|intensit\w*)|reflect\w*",
 }
-"""Columns and their names in headings, in small letters."""
+"""Columns and their names in headings, in small letters and without units."""
 
 _SHADES = ("red", "green", "blue"), ("intensity",)
 """Columns that colour points, the best first."""
 
-_TRIPLES = {6: (3,), 7: (4, 3), 8: (3, 4, 5), 9: (3, 6), 10: (3, 4, 6, 7)}
+_TRIPLES = {6: (3,), 7: (4, 3), 8: (5, 4, 3), 9: (6, 3), 10: (7, 6, 4, 3)}
 """Number of columns without a heading → where colours may begin, the likeliest first."""
 
 _TYPES = {
@@ -52,13 +52,14 @@ class Stream(PointStream):
 
     def __init__(self, path: Path) -> None:
         names, table = _pcd(path) if path.suffix.lower() == ".pcd" else _text(path, read_text(path))
-        column = {
-            key: names.index(own)
-            for key, spelled in _COLUMNS.items()
-            if (own := next((name for name in spelled if name in names), None)) is not None
-        }
         if not len(table):
             raise InputError("has no points", path=path)
+        if "rgb" in names and "red" not in names:
+            packed = table[:, names.index("rgb")]
+            whole = (packed == np.rint(packed)).all()
+            table = np.column_stack([table, *judge.unpacked(packed.astype("<u4" if whole else "<f4"))])
+            names = [*names[: table.shape[1] - 3], "red", "green", "blue", *names[table.shape[1] - 3 :]]
+        column = {name: names.index(name) for name in _COLUMNS if name in names}
         if missing := [name for name in "xyz" if name not in column]:
             raise InputError(f"has no column {missing[0]!r} (found {' '.join(names)})", path=path)
         self._positions = table[:, [column[name] for name in "xyz"]]
@@ -68,7 +69,7 @@ class Stream(PointStream):
         scales = judge.full_scales(np.dtype(np.float64))
         super().__init__(path, len(table), (self._positions, self._values, unmarked), scales)
         if not shades:
-            self.lack = f"has no colours (found columns {' '.join(names)})"
+            self.lack = f"has no colours (found columns {' '.join(names)}); name them red, green and blue"
 
     def raw(self, rows: int, start: int) -> Iterator[MarkedPoints]:
         for first in range(start, self.count, rows):
@@ -77,53 +78,81 @@ class Stream(PointStream):
             yield self._positions[part], values, np.zeros(len(values), bool)
 
 
-def holds_points(path: Path) -> bool:
-    """Return whether the first lines of a text are those of a table of points."""
+def check_points(path: Path) -> None:
+    """Raise an `InputError` unless the first lines of a text are those of a table of points."""
     if is_table(path):
-        return True
-    with suppress(InputError, OSError), path.open("rb") as file:
-        head = file.read(_HEAD).decode("utf-8-sig", "replace")
-        return {"x", "y", "z"} <= set(_text(path, head.rpartition("\n")[0] or head)[0])
-    return False
+        return
+    with path.open("rb") as file:
+        head = decoded(path, file.read(_HEAD))
+    names, _ = _text(path, re.sub(r"[^\r\n]*$", "", head) or head)
+    if not {"x", "y", "z"} <= set(names):
+        raise InputError(f"has no columns x, y and z (found {' '.join(names)})", path=path)
 
 
 def _text(path: Path, text: str) -> tuple[list[str], NDArray[np.float64]]:
-    """Return the names of the columns and the rows of a text, with or without a heading."""
-    text = plain_numbers(text)
-    lines = iter(enumerate(text.split("\n", _LINES)))
-    names, first = list[str](), 0
-    for number, line in lines:
+    """Return the names of the columns and the rows of a text, with or without a heading.
+
+    Of a table whose heading names x, y and z, only known columns are read, and their names are the first.
+    """
+    text = text.replace("\r\n", "\n").replace("\r", "\n").replace('"', "")
+    names, heading, first = list[str](), "", 0
+    for number, line in enumerate(text.split("\n", _LINES)):
         words = re.findall(r"\w+", line.lower())
-        first = number
-        if any(re.match(r"[a-df-z_]|e\w", word) for word in words if word != "nan"):  # a heading
-            names = words
-        elif len(words) > 1 and not line.lstrip().startswith(("#", "/", "%")):
+        first, named = number, {"x", "y", "z"} <= set(names)
+        if not named and any(re.match(r"[a-df-z_]|e\w", word) for word in words if word != "nan"):
+            names, heading = _names(line), line
+        elif len(words) > 1 and re.match(r"\s*[^\s#/%].*\d", line):
             break
-    if not any(map(str.isdigit, text)):
+    rows = text.split("\n", first)[-1]
+    if not any(map(str.isdigit, rows)):
         raise InputError("has no points", path=path)
+    if any(mark in heading for mark in ",;\t"):
+        rows = re.sub(r"(?<=([,;\t]))(?=\1|\n)", "nan", rows)  # empty fields
+    rows = rows.replace(f"\n{heading}\n", "\n") if heading else rows
+    rows = re.sub(r"\n[ \t]*\d+[ \t]*(?=\n)", "", rows)  # numbers of points, one for each scan
+    known = [i for i, name in enumerate(names) if name in _COLUMNS] if named else None
     try:
-        table = np.loadtxt(io.StringIO(text), np.float64, comments=("#", "//", "%"), skiprows=first, ndmin=2)
+        table = np.loadtxt(
+            io.StringIO(plain_numbers(rows)), comments=("#", "//", "%"), usecols=known, ndmin=2
+        )
     except ValueError as error:
-        raise InputError(f"is not a table of numbers: {error}", path=path) from error
-    if table.size and not {"x", "y", "z"} <= set(names):
+        text = str(error).partition(";")[0]
+        raise InputError(f"is not a table of numbers: {text}", path=path) from error
+    if known is not None:
+        names = [names[i] for i in known] + [name for i, name in enumerate(names) if i not in known]
+    elif table.size:
         names = _unnamed(path, table)
-    if table.size and len(names) != table.shape[1]:
-        raise InputError(f"has {table.shape[1]} columns, and a heading of {len(names)}", path=path)
     return names, table
+
+
+def _names(heading: str) -> list[str]:
+    """Return the names of columns in a heading without units, the usual ones for those that have others."""
+    mark = next((mark for mark in ";,\t" if mark in heading), None)
+    plain = re.sub(r"\[.*?\]|\(.*?\)", "", heading.lower()).strip(" #/%")
+    words = [word.strip(" #/%'").replace(" ", "_") for word in plain.split(mark)]
+    usual = {word: key for word in words for key, spelled in _COLUMNS.items() if re.fullmatch(spelled, word)}
+    return [usual.get(word, word) for word in words]
 
 
 def _unnamed(path: Path, table: NDArray[np.float64]) -> list[str]:
     """Return the names of columns without a heading, by their number and values."""
     count = table.shape[1]
+    whole = [bool((values == np.rint(values)).all()) for values in table.T]
+    grid = whole[:5] == [True, True, False, False, False] and table[:, :2].min() >= 0
+    if grid and (count > 6 or whole[5:] == [True]):
+        return ["row", "column", *_unnamed(path, table[:, 2:])]  # of a scan's grid, as FARO writes them
     names = ["x", "y", "z", *(["intensity"] if count == 4 else [f"column_{k + 1}" for k in range(3, count)])]
+    found = []
     for start in _TRIPLES.get(count, ()):
-        values = table[:, start : start + 3]
-        whole = (values == np.rint(values)).all() and values.max(initial=0) <= 65535
-        if values.min(initial=0) >= 0 and (whole or values.max(initial=0) <= 1):
-            names[start : start + 3] = ["red", "green", "blue"]
-            return names
-    if count < 3 or count > 4:
-        text = f"has {count} columns without a heading, of which none are colours from 0 to 255 or 0 to 1"
+        values, top = table[:, start : start + 3], table[:, start : start + 3].max(initial=0)
+        if values.min(initial=0) >= 0 and ((all(whole[start : start + 3]) and top <= 65535) or top <= 1):
+            varying = bool(np.ptp(values, axis=0).all())
+            found.append((not varying, top > 255, len(found), start))
+    if found:
+        start = min(found)[-1]
+        names[start : start + 3] = ["red", "green", "blue"]
+    elif count < 3 or count > 4:
+        text = f"has {count} columns without a heading of x, y and z, none of them colours from 0 to 255 or 0 to 1"
         raise InputError(text, path=path, hint="add a heading, such as: x y z red green blue")
     return names
 
@@ -162,10 +191,9 @@ def _pcd(path: Path) -> tuple[list[str], NDArray[np.float64]]:
     for field, name in zip(fields, rows.names or (), strict=False):
         own = table[name].reshape(len(table), -1)
         if field.lower() in ("rgb", "rgba") and own.dtype.itemsize == 4:
-            packed = np.ascontiguousarray(own[:, 0]).view("<u4")
             names += ["red", "green", "blue"]
-            columns += [(packed >> shift & 255).astype(np.float64) for shift in (16, 8, 0)]
+            columns += judge.unpacked(own[:, 0])
         else:
-            names += [field.lower(), *(f"{field}_{k}" for k in range(1, own.shape[1]))]
+            names += [*_names(field), *(f"{field}_{k}" for k in range(1, own.shape[1]))]
             columns += list(own.T.astype(np.float64))
     return names, np.column_stack(columns)

@@ -15,7 +15,7 @@ from g2ard.config.choices import BLACK, Colour
 from g2ard.errors import InputError
 from g2ard.io.finding import usable
 from g2ard.io.paths import check_regular
-from g2ard.io.signs import Sign, foreign, sign_of
+from g2ard.io.signs import MESH, Sign, foreign, sign_of
 
 Kind = Literal["splats", "points", "views"]
 
@@ -36,7 +36,7 @@ READERS: dict[Kind, dict[str, tuple[str, ...]]] = {
         "las": (".las", ".laz"),
         "e57": (".e57",),
         "points3d": ("points3d.bin", "points3d.txt"),
-        "cloud_text": (".pcd", ".xyz", ".pts", ".asc"),
+        "cloud_text": (".pcd", ".xyz", ".xyzrgb", ".xyzn", ".xyzi", ".pts", ".asc", ".neu"),
         "clouds": (),
     },
     "views": {
@@ -137,10 +137,16 @@ def file_format(path: str | Path) -> str:
 
 def reader(path: Path, name: str, expected: Kind) -> Any:
     """Return the module that reads a file or folder of a format; reject one of another kind."""
+    from g2ard.io import plyfiles
+
     found = KINDS[name]
     if expected == "points" and name == "colmap":
         name = "points3d"
     elif found != expected and (expected, name) != ("views", "e57"):
+        if name in ("glb", "usd"):  # its error says what it holds instead of Gaussians
+            import_module(f"g2ard.io.{name}").read(path)
+        if name == "cloud_ply" and plyfiles.is_mesh(plyfiles.read_header(path)):
+            raise InputError("is a mesh", path=path, hint=MESH)
         what = _NAMES[found] if found != "views" else name
         hint = _OTHER_KINDS.get((expected, found))
         raise InputError(f"expected {_NAMES[expected]}, found {what}", path=path, hint=hint)
@@ -160,14 +166,18 @@ def _of_file(path: Path, modified: int, size: int) -> str:
         return _ply_format(path)
     if suffix == ".json":
         return _json_format(path)
-    if suffix in (".txt", ".csv", ""):
-        from g2ard.io.cloud_text import holds_points
+    reason = ""
+    if suffix in (".txt", ".csv", ".tsv", ".dat", ""):
+        from g2ard.io.cloud_text import check_points
 
-        if holds_points(path):
+        try:
+            check_points(path)
             return "cloud_text"
+        except InputError as error:
+            reason = f", and no table of points: {error.message}"
     raise InputError(
-        f"unknown format {path.suffix!r} (scenes: .ply .sog .spz .glb .gltf .splat .ksplat .usda .usdc; "
-        "point clouds: .ply .las .laz .e57 .pcd .xyz; views: a COLMAP folder, a .json, or a training run)",
+        f"unknown format {path.suffix!r}{reason} (scenes: .ply .sog .spz .glb .gltf .splat .ksplat .usda "
+        ".usdc; point clouds: .ply .las .laz .e57 .pcd .xyz .csv; views: a COLMAP folder, a .json, or a run)",
         path=path,
     )
 

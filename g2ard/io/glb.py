@@ -28,6 +28,7 @@ from g2ard.io.jsonfile import Number, Place, Row, Vector, Whole, checked, parse_
 from g2ard.io.packing import packing_order, rounding, unit_quats, writable
 from g2ard.io.paths import check_regular, decoded
 from g2ard.io.sanitize import Raw, cleaned
+from g2ard.io.signs import MESH, SCAN
 from g2ard.io.types import Note, Noted
 from g2ard.progress import plural
 from g2ard.scene.splats import SH_C0, Splats
@@ -231,6 +232,7 @@ _Entry = TypeVar("_Entry")
 
 
 class _Primitive(msgspec.Struct):
+    mode: Any = 4  # triangles
     attributes: dict[str, Any] = {}
     extensions: dict[str, Any] = {}
 
@@ -337,7 +339,10 @@ def _scene(path: Path, document: _Document, binary: bytes) -> Noted:
     others = sum(not _has_splats(primitive) for mesh in document.meshes for primitive in mesh.primitives)
     found = placed(path, _shown(path, document, binary))
     if found is None:
-        raise InputError(f"has no primitive with {EXTENSION}", path=path)
+        modes = {primitive.mode for mesh in document.meshes for primitive in mesh.primitives}
+        held = "points" if modes == {0} else "a mesh" if modes else "nothing"
+        hint = SCAN if modes == {0} else MESH if modes else None
+        raise InputError(f"holds {held}: no primitive has {EXTENSION}", path=path, hint=hint)
     text = f"{plural(others, 'other primitive')} ignored"
     found = restored(found[0], _axes(document.nodes)), found[1]
     return (found[0], (Note("ignored_meshes", others, text), *found[1])) if others else found

@@ -61,6 +61,12 @@ def white(colors: Values, scales: Sequence[float]) -> float:
     return next(fits, scales[-1])
 
 
+def unpacked(packed: Values) -> list[NDArray[np.float64]]:
+    """Return red, green and blue of PCL's colours, 0xRRGGBB in 32-bit integers or in floats of these bits."""
+    bits = np.ascontiguousarray(packed).view("<u4")
+    return [(bits >> shift & 255).astype(np.float64) for shift in (16, 8, 0)]
+
+
 def shades(values: Values, limits: tuple[float, float] | None = None) -> tuple[float, float]:
     """Return the intensities that mean black and white: stated limits, if most values fill a part of them."""
     low, high = bulk(values)

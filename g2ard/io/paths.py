@@ -82,12 +82,12 @@ def plain_numbers(text: str) -> str:
     )
     text = re.sub(r"(?<=\d),(?=\d)", ".", text) if decimal else text
     text = text.replace(",", " ").replace(";", " ")
-    return NOT_FINITE.sub("nan", text) if re.search(r"nan\(|#", text, re.IGNORECASE) else text
+    return NOT_FINITE.sub("nan", text) if re.search(r"nan\(|#|n/?[aou]", text, re.IGNORECASE) else text
 
 
 _SAMPLE = 1 << 14  # characters that tell whether commas are decimal
-NOT_FINITE = re.compile(r"[+-]?(nan\([^)\s]*\)|\d\.#\w+)", re.IGNORECASE)
-"""Numbers that are not finite, as C and C++ write them on Windows."""
+NOT_FINITE = re.compile(r"[+-]?(nan\([^)\s]*\)|\d\.#\w+|\b(null|none|n/?a)\b)", re.IGNORECASE)
+"""Numbers that are not finite, as C and C++ write them on Windows, and words for missing ones."""
 
 
 def output_names(path: str | Path, names: Sequence[str]) -> list[str]:

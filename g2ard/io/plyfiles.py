@@ -28,7 +28,11 @@ _RENDER_MODES: dict[str, RenderModel | Literal["2dgs"]] = {
 }
 """Comments of brush and Postshot, in lower case."""
 
-COLOR_NAMES = (["red", "green", "blue"], ["r", "g", "b"], ["diffuse_red", "diffuse_green", "diffuse_blue"])
+COLOR_NAMES = [
+    [f"{prefix}{name}" for name in names]
+    for names in (["red", "green", "blue"], ["r", "g", "b"], ["rf", "gf", "bf"])
+    for prefix in ("", "diffuse_", "color_", "vertex_")
+]
 """Names of colours."""
 
 _HEADER_LIMIT = 1 << 20  # longest header, bytes
@@ -102,15 +106,20 @@ class _Plain(io.BufferedReader):
 
 
 def scene_names(properties: Sequence[str]) -> dict[str, str]:
-    """Return the properties of a Gaussian scene by their usual names, without CloudCompare's prefix.
+    """Return properties by their usual names, without the prefixes of CloudCompare and 3dgsconverter.
 
     >>> scene_names(["x", "scalar_f_dc_0", "filter_3D", "red"])
     {'x': 'x', 'filter_3d': 'filter_3D', 'red': 'red', 'f_dc_0': 'scalar_f_dc_0'}
     """
     found: dict[str, str] = {}
-    for name in sorted(properties, key=lambda name: name.lower().startswith("scalar_")):
-        found.setdefault(name.lower().removeprefix("scalar_"), name)
+    for name in sorted(properties, key=lambda name: name.lower().startswith("scal")):
+        found.setdefault(re.sub(r"^(scalar_|scal_)+", "", name.lower()), name)
     return found
+
+
+def is_mesh(header: PlyHeader) -> bool:
+    """Return whether a file has faces."""
+    return any(header.counts.get(name) for name in ("face", "tristrips"))
 
 
 def groups_of(header: PlyHeader) -> list[str]:

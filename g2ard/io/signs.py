@@ -63,9 +63,9 @@ class Sign(NamedTuple):
 _SAVED = "give the .ply that the trainer exports"
 _HIDDEN = "its Gaussians are in neural networks beside it: export a .ply with the program that trained them"
 _UNPACK = "unpack it and give the file or folder in it"
-_MESH = "sample points with colours on it (CloudCompare, MeshLab), then `g2ard lift` them"
+MESH = "sample points with colours on it (CloudCompare, MeshLab), then `g2ard lift` them"
 _FILM = "take photos from it (`ffmpeg -i VIDEO -r 2 photos/%04d.jpg`), and estimate their poses with COLMAP"
-_SCAN = "export the point cloud with its colours as .ply, .las or .e57"
+SCAN = "export the point cloud with its colours as .ply, .las or .e57"
 _COLMAP = "export the cameras there for COLMAP, as a folder with cameras.txt and images.txt"
 _REGISTER = "`g2ard register --poses` reads it; other commands need a lens per photo"
 _NERF = "`ns-export gaussian-splat --load-config config.yml --output-dir out` writes a .ply"
@@ -149,8 +149,8 @@ SIGNS = (
     Sign("an LCC scene of XGRIDS", "`splat-transform scene.lcc scene.ply` (npm: @playcanvas/splat-transform) converts it", names="*.lcc"),
     Sign("a RAD scene of Spark", "convert the .ply, .spz or .sog that Spark built it from", names="*.rad"),
     Sign("a PTX scan of Leica", "`CloudCompare -O cloud.ptx -C_EXPORT_FMT PLY -SAVE_CLOUDS` converts it with its colours", names="*.ptx"),
-    Sign("a scan or recording", _SCAN, names="*.rcp *.rcs *.fls *.zfs *.rdbx *.bag"),
-    Sign("a mesh", _MESH, names="*.obj *.fbx *.stl *.dae *.3ds *.off *.b3dm *.blend *.drc"),
+    Sign("a scan or recording", SCAN, names="*.rcp *.rcs *.fls *.zfs *.rdbx *.bag"),
+    Sign("a mesh", MESH, names="*.obj *.fbx *.stl *.dae *.3ds *.off *.b3dm *.blend *.drc"),
     Sign("a HEIC photo", "convert it to JPEG", (b"ftyphe", b"ftypmif1", b"ftypmsf1"), at=4),
     Sign("an AVIF photo", "convert it to PNG", (b"ftypavi",), at=4),
     Sign("an OpenEXR photo", "convert it to PNG", (b"v/1\1",)),

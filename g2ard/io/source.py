@@ -85,7 +85,7 @@ class Source:
         """
         stream = self._points
         if not stream.channels and len(stream.sample) and not bare:
-            raise InputError(stream.lack, path=self.file, hint=_UNCOLORED)
+            raise InputError(stream.lack, path=self.file, hint=stream.todo or _UNCOLORED)
         return stream
 
     @property

@@ -211,6 +211,7 @@ class PointStream(Stream[RawPoints]):
         sample: (n, 3) finite positions from all parts of the cloud, without noise.
         channels: 3 for colours, 1 for intensities, 0 if there is nothing to colour points by.
         lack: why there are no colours.
+        todo: what to do then, if not the usual.
         system: the map system that the file states.
         axes: axes of the coordinates: z is up in maps; None if neither the format nor a map tells.
     """
@@ -237,7 +238,7 @@ class PointStream(Stream[RawPoints]):
         notes = (*notes, _DEGREES) if _in_degrees(middle, extent) else notes
         super().__init__(path, count, np.rint(middle) if far else None, notes, "point")
         self.channels, self.scales = values.shape[1], scales
-        self.lack = "has neither colours nor intensities that vary"
+        self.lack, self.todo = "has neither colours nor intensities that vary", ""
         self.system: str | None = None
         self.axes: Axes | None = "RFU" if far else None
         self._range = 0.0, 1.0

@@ -20,6 +20,7 @@ from g2ard.io.atomic import atomic_output
 from g2ard.io.glb import LINEAR_NOTE, placed
 from g2ard.io.packing import rounding, unit_quats, writable
 from g2ard.io.sanitize import Raw, cleaned
+from g2ard.io.signs import MESH, SCAN
 from g2ard.io.spz import FLIPS
 from g2ard.io.types import Note, Noted
 from g2ard.progress import Progress, plural, silent
@@ -197,7 +198,8 @@ def _nothing(path: Path, held: list[Any], fields: int) -> str:
             f"holds surfels (flat particles), which are not supported; export the scene as .ply or {_SCHEMA}"
         )
     types = sorted({str(prim.GetTypeName()) for prim in held} - {"", "Xform", "Scope"})
-    return f"has no prim of type {_SCHEMA}" + (f", only {', '.join(types[:4])}" if types else "")
+    todo = f": {MESH}" if "Mesh" in types else f": {SCAN}" if "Points" in types else ""
+    return f"has no prim of type {_SCHEMA}" + (f", only {', '.join(types[:4])}{todo}" if types else "")
 
 
 def _read_prim(path: Path, pxr: Any, prim: Any) -> Noted:

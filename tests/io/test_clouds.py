@@ -10,6 +10,7 @@ import pytest
 
 from g2ard.errors import InputError, OutputError
 from g2ard.io import kind, read_cloud, read_points, write_points
+from g2ard.io.source import Source
 from g2ard.io.types import Points
 from helpers.cloud_files import FAR, columns, las, ply
 from helpers.opened import stream_of
@@ -120,6 +121,41 @@ def test_ply_with_other_color_names(tmp_path: Path) -> None:
     rows = np.array([[0, 0, 0, 255, 0, 51.0]])
     points = read_points(ply(tmp_path / "a.ply", columns("f4", "u1", names), rows))
     np.testing.assert_allclose(points.colors, [[1, 0, 0.2]])
+
+
+@pytest.mark.parametrize("form", ["{}", "scalar_{}", "scal_{}", "scalar_scal_{}", "diffuse_{}", "Color_{}"])
+@pytest.mark.parametrize("word", ["Red Green Blue", "red green blue", "R G B", "r g b", "Rf Gf Bf"])
+def test_spellings_of_colours(tmp_path: Path, word: str, form: str) -> None:
+    types = dict.fromkeys(map(form.format, word.split()), "f4")
+    rows = np.array([[0, 0, 0, 255, 0, 51], [1, 1, 1, 0, 255, 51.0]])
+    points = read_points(ply(tmp_path / "a.ply", dict.fromkeys("XYZ", "f4") | types, rows))
+    np.testing.assert_allclose(points.colors, [[1, 0, 0.2], [0, 1, 0.2]])
+
+
+@pytest.mark.parametrize("name", ["rgb", "RGBA", "scalar_rgb"])
+@pytest.mark.parametrize("kind_", ["f4", "u4", "i4"])
+def test_packed_colours(tmp_path: Path, kind_: str, name: str) -> None:
+    bits = np.array([0xFF0033, 0x00FF33], "<u4")
+    types = dict.fromkeys("xyz", "f4") | {name: kind_}
+    rows = np.column_stack([np.eye(2, 3), bits.view(f"<{kind_}").astype(np.float64)])
+    points = read_points(ply(tmp_path / "a.ply", types, rows))
+    np.testing.assert_allclose(points.colors, [[1, 0, 0.2], [0, 1, 0.2]])
+
+
+def test_other_names_of_colours_are_told(tmp_path: Path) -> None:
+    types = dict.fromkeys(["x", "y", "z", "Rouge"], "f4")
+    with pytest.raises(InputError, match=r"found x y z Rouge\); rename"):
+        Source(ply(tmp_path / "a.ply", types, np.ones((2, 4)))).cloud()
+
+
+@pytest.mark.parametrize("faces", [3, 4])
+@pytest.mark.parametrize("texture", [(), ("s", "t"), ("texture_u", "texture_v")])
+@pytest.mark.parametrize("wanted", ["scene", "cloud"])
+def test_a_mesh_without_colours_is_named(tmp_path: Path, wanted: str, texture: tuple, faces: int) -> None:
+    types = dict.fromkeys(["x", "y", "z", *texture], "f4")
+    source = Source(ply(tmp_path / "a.ply", types, np.ones((4, len(types))), faces=faces))
+    with pytest.raises(InputError, match=r"is a mesh.*sample points"):
+        source.scene if wanted == "scene" else source.cloud()
 
 
 @pytest.mark.parametrize("corners", [3, 5])

@@ -11,6 +11,7 @@ import pytest
 from g2ard.errors import InputError
 from g2ard.io import read_splats, write_splats
 from g2ard.io.glb import EXTENSION, SPZ_EXTENSION
+from g2ard.io.source import Source
 from g2ard.scene.splats import Splats
 from g2ard.scene.transform import deformed, rotation_matrices
 from helpers.glb_files import glb_parts, write_glb
@@ -156,3 +157,16 @@ def test_linear_colours_are_noted(tmp_path: Path, space: str) -> None:
     document["meshes"][0]["primitives"][0]["extensions"][EXTENSION]["colorSpace"] = space
     notes = read_scene(write_glb(tmp_path / "a.glb", document, binary)).notes
     assert [note.code for note in notes] == ["linear_colors"] * ("lin" in space)
+
+
+@pytest.mark.parametrize(("mode", "says"), [(0, "holds points"), (4, "holds a mesh"), (None, "holds a mesh")])
+@pytest.mark.parametrize("wanted", ["scene", "cloud"])
+def test_meshes_and_points_are_named(tmp_path: Path, wanted: str, mode: int | None, says: str) -> None:
+    document, binary = parts_of(tmp_path, scene(4, 0))
+    (primitive,) = document["meshes"][0]["primitives"]
+    del primitive["extensions"], primitive["mode"]
+    primitive.update({} if mode is None else {"mode": mode})
+    write_glb(tmp_path / "a.glb", document, binary)
+    source = Source(tmp_path / "a.glb")
+    with pytest.raises(InputError, match=says):
+        source.scene if wanted == "scene" else source.cloud()

@@ -270,7 +270,7 @@ def test_colours_in_place_of_harmonics(tmp_path: Path, dtype: str, names: tuple,
 
 
 @pytest.mark.parametrize("degree", [0, 2])
-@pytest.mark.parametrize("prefix", ["scalar_", "Scalar_"])
+@pytest.mark.parametrize("prefix", ["scalar_", "Scalar_", "scal_", "scalar_scal_"])
 def test_names_of_cloudcompare(tmp_path: Path, degree: int, prefix: str) -> None:
     truth = scene(degree=degree)
     cols = {name if name in "xyz" else prefix + name: v for name, v in columns(truth).items()}

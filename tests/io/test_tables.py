@@ -7,6 +7,7 @@ import pytest
 
 from g2ard.errors import InputError
 from g2ard.io import kind, read_cloud
+from g2ard.io.source import Source
 from g2ard.jobs.register import poses_for
 from helpers.view_files import orbit
 
@@ -57,6 +58,79 @@ def test_six_columns(tmp_path: Path, suffix: str, between: str, point: str, top:
 )
 def test_further_columns(tmp_path: Path, columns: list[np.ndarray], top: str) -> None:
     is_cloud(written(tmp_path / "a.txt", columns, top=top))
+
+
+HEADED = {
+    "units": ("X[m],Y[m],Z[m],Red[],Green[],Blue[],Reflectance[dB]", "{x},{y},{z},{r},{g},{b},-10"),
+    "units in words": ("Easting (m);Northing (m);Elevation (m);R;G;B", "{x};{y};{z};{r};{g};{b}"),
+    "CloudCompare": ("//X Y Z Rf Gf Bf", "{x} {y} {z} {rf} {gf} {bf}"),
+    "Color_R": ("x,y,z,Color_R,Color_G,Color_B", "{x},{y},{z},{r},{g},{b}"),
+    "quotes": ('"x","y","z","r","g","b"', '"{x}","{y}","{z}","{r}","{g}","{b}"'),
+    "words": ("label,x,y,z,time,red,green,blue", "ground,{x},{y},{z},2024-05-01T12:00:00,{r},{g},{b}"),
+    "empty": ("x,y,z,intensity,red,green,blue,class", "{x},{y},{z},,{r},{g},{b},"),
+    "empty, tabs": ("x\ty\tz\ti\tr\tg\tb", "{x}\t{y}\t{z}\t\t{r}\t{g}\t{b}"),
+    "NULL": ("x,y,z,intensity,red,green,blue", "{x},{y},{z},NULL,{r},{g},{b}"),
+    "last commas": ("x,y,z,r,g,b", "{x},{y},{z},{r},{g},{b},"),
+    "a number of points": ("# X Y Z R G B\n# 40 points\n40", "{x} {y} {z} {r} {g} {b}"),
+    "packed": ("x,y,z,rgb", "{x},{y},{z},{packed}"),
+    "packed float": ("x,y,z,rgb", "{x},{y},{z},{bits}"),
+    "grid of FARO": ("", "0 {i} {x}1 {y}1 {z}1 {r} {g} {b}"),
+    "grid with intensity": ("", "0 {i} {x}1 {y}1 {z}1 0.5 {r} {g} {b}"),
+    "zero normals": ("", "{x} {y} {z} 0 0 0 {r} {g} {b}"),
+    "normals up": ("", "{x} {y} {z} 0 0 1 {r} {g} {b}"),
+    "zero normals behind": ("", "{x} {y} {z} {r} {g} {b} 0 0 0"),
+    "intensity of 16 bits behind": ("", "{x} {y} {z} {r} {g} {b} {wide}"),
+}
+"""Headings, and rows."""
+
+
+def rows_of(form: str) -> list[str]:
+    rows = []
+    for i, ((x, y, z), (r, g, b)) in enumerate(zip(XYZ.tolist(), RGB.tolist(), strict=True)):
+        packed = r << 16 | g << 8 | b
+        values = {"x": f"{x:.3f}", "y": f"{y:.3f}", "z": f"{z:.3f}", "r": r, "g": g, "b": b, "i": i}
+        values |= {"rf": r / 255, "gf": g / 255, "bf": b / 255, "wide": 300 + 50 * i, "packed": packed}
+        rows.append(form.format(**values, bits=f"{np.uint32(packed).view(np.float32):.9g}"))
+    return rows
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".txt", ".asc", ".tsv"])
+@pytest.mark.parametrize("end", ["\n", "\r\n", "\r"])
+@pytest.mark.parametrize("case", HEADED)
+def test_tables_as_programs_write_them(tmp_path: Path, case: str, end: str, suffix: str) -> None:
+    heading, form = HEADED[case]
+    text = end.join([*heading.split("\n"), *rows_of(form), ""])
+    (tmp_path / f"a{suffix}").write_bytes(text.encode())
+    found = read_cloud(tmp_path / f"a{suffix}").points
+    np.testing.assert_allclose(found.positions, XYZ, atol=2e-4)
+    np.testing.assert_allclose(found.colors, RGB / 255, atol=1e-6)
+
+
+@pytest.mark.parametrize("between", ["20", "x y z r g b", "x y z r g b\n20", ""])
+def test_several_scans_in_a_table(tmp_path: Path, between: str) -> None:
+    rows = rows_of("{x} {y} {z} {r} {g} {b}")
+    lines = [between, *rows[:20], between, *rows[20:], ""]
+    (tmp_path / "a.pts").write_text("\n".join(lines))
+    is_cloud(tmp_path / "a.pts")
+
+
+@pytest.mark.parametrize("suffix", ["xyz", "xyzrgb", "xyzi", "xyzn", "neu", "pts", "csv", "tsv", "dat"])
+def test_suffixes_of_tables(tmp_path: Path, suffix: str) -> None:
+    is_cloud(written(tmp_path / f"a.{suffix}", [XYZ, RGB]))
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("Rouge,Vert,Bleu,X,Y,Z\n1,2,3,4,5,6\n7,8,9,1,2,3\n", "found columns x y z rouge vert bleu"),
+        ("x,y,z,r,g,b\n1,2,3,4,5,6\n1,2,3,4,5,six\n", "'six'"),
+        ("a,b\n1,2\n3,4\n", "no table of points: has 2 columns without a heading of x, y and z"),
+    ],
+)
+def test_tables_that_cannot_be_read_say_why(tmp_path: Path, text: str, says: str) -> None:
+    (tmp_path / "a.csv").write_text(text)
+    with pytest.raises(InputError, match=says):
+        Source(tmp_path / "a.csv").cloud()
 
 
 def test_intensities_are_grey(tmp_path: Path) -> None:
