@@ -142,7 +142,7 @@ def _unnamed(path: Path, table: NDArray[np.float64]) -> list[str]:
     if grid and (count > 6 or whole[5:] == [True]):
         return ["row", "column", *_unnamed(path, table[:, 2:])]  # of a scan's grid, as FARO writes them
     names = ["x", "y", "z", *(["intensity"] if count == 4 else [f"column_{k + 1}" for k in range(3, count)])]
-    found = []
+    found = list[tuple[bool, bool, int, int]]()
     for start in _TRIPLES.get(count, ()):
         values, top = table[:, start : start + 3], table[:, start : start + 3].max(initial=0)
         if values.min(initial=0) >= 0 and ((all(whole[start : start + 3]) and top <= 65535) or top <= 1):
@@ -152,7 +152,7 @@ def _unnamed(path: Path, table: NDArray[np.float64]) -> list[str]:
         start = min(found)[-1]
         names[start : start + 3] = ["red", "green", "blue"]
     elif count < 3 or count > 4:
-        text = f"has {count} columns without a heading of x, y and z, none of them colours from 0 to 255 or 0 to 1"
+        text = f"has {count} columns without a heading of x, y and z, none of them colours up to 1 or 255"
         raise InputError(text, path=path, hint="add a heading, such as: x y z red green blue")
     return names
 

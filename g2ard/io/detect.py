@@ -189,7 +189,8 @@ def _check_content(path: Path) -> None:
         return
     if not sign.reads:
         raise sign.error(path)
-    if suffix in _OWN and sign.reads not in _OWN[suffix]:
+    known = _OWN.get(suffix, () if suffix not in _BY_NAME and path.name.lower() not in _BY_NAME else None)
+    if known is not None and sign.reads not in known:
         hint = f"rename it to {path.stem}{sign.reads}"
         raise InputError(f"is {sign.what} in spite of its name", path=path, hint=hint)
 
@@ -450,12 +451,6 @@ def _json_format(path: Path) -> str:
     content = read_any_json(path)
     if name := json_format(content):
         return name
-    if isinstance(content, dict) and {"geometricError", "root"} <= set(content):
-        raise InputError(
-            "is a tileset of 3D Tiles, for viewers such as CesiumJS",
-            path=path,
-            hint="give the scene that it was made of, or one of its .glb tiles",
-        )
     if not isinstance(content, dict):
         raise InputError(
             "is a JSON list, but not cameras of INRIA's trainer or of nerfstudio's ns-export", path=path

@@ -149,7 +149,7 @@ class _Scan(PointStream):
         colors = np.zeros((len(positions), len(self._color)), np.float32)
         for channel, name in enumerate(self._color):
             colors[:, channel] = fields[name]
-        noise = np.zeros(len(positions), bool)
+        noise = (a == 0) & (b == 0) & (c == 0)  # relative to the scanner: no return
         for name in self._marks():
             if name in _UNSEEN.get(self._color, ()):
                 colors[fields[name] != 0] = 0

@@ -8,6 +8,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path, PureWindowsPath
 from typing import TYPE_CHECKING
+from urllib.parse import unquote
 
 if TYPE_CHECKING:
     from g2ard.io.types import Note
@@ -57,7 +58,8 @@ class Finder:
        other, so that `C:\\capture\\images\\a\\1.png` is found as `images/a/1.png`, `a/1.png` or `1.png`;
     3. in the same order, a file of that name in other capitals or another Unicode form;
     4. in the same order, a photo of that name with another suffix;
-    5. in the same order, a photo whose name is the same in another character set.
+    5. in the same order, a photo whose name is the same in another character set, with the escapes of
+       addresses (`%20`), or with `_` for letters that Windows does not allow.
 
     Empty files, and those that systems leave in folders, are ignored.
 
@@ -171,13 +173,15 @@ def _folded(name: str) -> str:
 
 
 def _respelled(name: str) -> Iterator[str]:
-    """Yield a name as it is in other character sets, if it may have been written in one of them.
+    """Yield a name as in files and addresses of other systems, and as in other character sets.
 
     Bytes that are not UTF-8 are surrogates, as `os.fsdecode` returns them.
     """
+    yield name
+    yield unquote(name)
+    yield re.sub(r'[:*?"<>|]', "_", name)  # letters that Windows has not in names
     if name.isascii():
         return
-    yield name
     for wrong in ("utf-8", *_MISREAD_AS):
         with suppress(UnicodeError):
             data = name.encode(wrong, "surrogateescape" if wrong == "utf-8" else "strict")

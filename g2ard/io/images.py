@@ -1,9 +1,8 @@
-"""Photos as arrays that fit their cameras, PNGs, contact sheets, and animations."""
+"""Photos as arrays that fit their cameras, PNGs, and animations."""
 
 from __future__ import annotations
 
 import itertools
-import math
 import re
 import shutil
 import subprocess
@@ -19,7 +18,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from PIL import Image, ImageCms, ImageDraw, ImageFont, ImageOps
+from PIL import Image, ImageCms, ImageOps
 
 from g2ard.config.choices import BLACK, Colour
 from g2ard.errors import InputError, MissingDependencyError
@@ -34,8 +33,6 @@ from g2ard.scene.samples import evenly_spaced
 _BORDER_PHOTOS = 5  # photos whose borders are compared
 _BORDER_COLOUR_SLACK, _BORDER_SHARE = 3 / 255, 0.8
 """Largest difference from a constant border colour, and the least share of border pixels that have it."""
-
-_SHEET_GAP = 6  # pixels between the images of a contact sheet
 
 
 def load_photo(
@@ -504,48 +501,6 @@ def png_bytes(image: ArrayLike) -> bytes:
     content = BytesIO()
     Image.fromarray(np.ascontiguousarray(to_bytes(image))).save(content, format="PNG", compress_level=3)
     return content.getvalue()
-
-
-def contact_sheet(
-    rows: Sequence[Sequence[ArrayLike]], labels: Sequence[str], *, row_labels: Sequence[str] = ()
-) -> NDArray[np.uint8]:
-    """Arrange images of any sizes in a grid on a dark background: a row per view, a column per kind.
-
-    Rows may be short, and have captions below.
-    """
-    grid = [
-        [Image.fromarray(np.ascontiguousarray(to_bytes(image))).convert("RGB") for image in row]
-        for row in rows
-    ]
-    if not any(grid):
-        raise InputError("a contact sheet needs images")
-    columns = max(map(len, grid))
-    widths = [max(row[c].width for row in grid if c < len(row)) for c in range(columns)]
-    heights = [max((cell.height for cell in row), default=0) for row in grid]
-    text = max(11, min(28, max(widths) // 20))
-    font, line = ImageFont.load_default(text), round(1.6 * text)
-    for c, label in enumerate(labels[:columns]):
-        widths[c] = max(widths[c], math.ceil(font.getlength(label)))
-    longest = max((math.ceil(font.getlength(caption)) for caption in row_labels), default=0)
-    widths[-1] += max(0, longest - sum(widths) - _SHEET_GAP * (columns - 1))
-    foot = line if row_labels else 0
-    lefts = [_SHEET_GAP + sum(widths[:c]) + _SHEET_GAP * c for c in range(columns)]
-    size = (
-        sum(widths) + _SHEET_GAP * (columns + 1),
-        line + sum(heights) + (foot + _SHEET_GAP) * len(grid) + _SHEET_GAP,
-    )
-    sheet = Image.new("RGB", size, (24, 24, 24))
-    draw = ImageDraw.Draw(sheet)
-    for left, label in zip(lefts, labels, strict=False):
-        draw.text((left, _SHEET_GAP), label, fill=(235, 235, 235), font=font)
-    top = _SHEET_GAP + line
-    for r, (row, height) in enumerate(zip(grid, heights, strict=True)):
-        for left, cell in zip(lefts, row, strict=False):
-            sheet.paste(cell, (left, top))
-        if r < len(row_labels):
-            draw.text((_SHEET_GAP, top + height), row_labels[r], fill=(200, 200, 200), font=font)
-        top += height + foot + _SHEET_GAP
-    return np.asarray(sheet)
 
 
 ANIMATIONS = (".gif", ".webp", ".mp4")

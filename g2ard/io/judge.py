@@ -61,6 +61,22 @@ def white(colors: Values, scales: Sequence[float]) -> float:
     return next(fits, scales[-1])
 
 
+_FINE = 0.25  # part of the distance of points by which float32 may round them
+
+
+@np.errstate(over="ignore", invalid="ignore")
+def coarse(positions: Values, apart: float) -> tuple[Note, ...]:
+    """Return a note if float32 rounded (n, 3) positions by much of the distance `apart` between them."""
+    if not len(positions) or not np.array_equal(positions, positions.astype(np.float32)):
+        return ()
+    step = float(np.spacing(np.abs(positions).max(axis=0).astype(np.float32)).max())
+    text = (
+        f"coordinates are rounded to steps of {step:g} by float32, which is coarse for points {apart:.2g} "
+        "apart; export them as float64 (.las, .laz, .e57), or with a shift (CloudCompare's Global Shift)"
+    )
+    return (Note("coarse_positions", len(positions), text),) if step > _FINE * apart > 0 else ()
+
+
 def unpacked(packed: Values) -> list[NDArray[np.float64]]:
     """Return red, green and blue of PCL's colours, 0xRRGGBB in 32-bit integers or in floats of these bits."""
     bits = np.ascontiguousarray(packed).view("<u4")

@@ -109,6 +109,9 @@ class Stream(RawStream):
         rows = plyfiles.spread_rows(self._rows, _JUDGED)
         scales, base = self._columns(rows, self._scales), self._columns(rows, self._rgb or _DC)
         opacities = rows[self._names["opacity"]]
+        with np.errstate(over="ignore", invalid="ignore"):
+            wide = 2 * np.exp(np.median(scales)) if len(rows) else 0.0
+        self.notes += judge.coarse(self._columns(rows, _MEANS), float(wide))
         if self._rgb is None:
             return judge.judged(scales, opacities, base, logs=True), 1.0
         full = judge.white(base, judge.full_scales(base.dtype))

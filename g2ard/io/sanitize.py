@@ -167,7 +167,7 @@ class Tally:
             hint = None if points else "use an earlier checkpoint of the training"
             raise InputError(f"none of its {plural(self.rows, self.item)} is finite", path=path, hint=hint)
         if self.noise == left:
-            text = f"all of its {plural(self.noise, 'point')} are marked as noise or invalid"
+            text = f"all of its {plural(self.noise, 'point')} are marked as noise or invalid, or at 0 0 0"
             raise InputError(text, path=path)
         changes = {
             "dropped_rows": (
@@ -175,7 +175,11 @@ class Tally:
                 f"non-finite {self.item}",
                 f"dropped (the first is row {self.first})",
             ),
-            "noise": (self.noise, "point", "dropped that the file marks as noise, withheld or invalid"),
+            "noise": (
+                self.noise,
+                "point",
+                "dropped that the file marks as noise or invalid, or stores at 0 0 0",
+            ),
             "clamped_logits": (self.logits, "opacity logit", f"beyond ±{LOGIT_LIMIT:g} clamped"),
             "clamped_scales": (self.scales, "log-scale", f"beyond ±{LOG_SCALE_LIMIT:g} clamped"),
             "zero_quats": (self.quats, "quaternion", "of length zero made the identity"),

@@ -73,6 +73,10 @@ _GRUT = "train or resume with `export_ply.enabled=true`, which writes a .ply"
 _GSPLAT = "`gsplat.export_splats`, or training with --save_ply, writes a .ply"
 _INRIA = "give point_cloud/iteration_N/point_cloud.ply, which the trainer saves beside it"
 _EDITOR = "open it in the editor, and export the scene as .ply"
+_LINK = "download the file that it links to, or export the scene where the page was made"
+_LAS = "convert the .las or .laz that it was made from, or export one of it"
+_SAVETXT = "of x y z red green blue in rows, `numpy.savetxt('cloud.xyz', array)` makes a table to lift"
+_PATH = "a path has no photos: give views with `render --views`, such as transforms.json or g2ard's .json"
 _EUROC = "`evo_traj euroc FILE --save_as_tum` converts it, and `g2ard register --poses` reads that"
 
 
@@ -84,10 +88,21 @@ def _poses(
 
 _CAPTURE, _PIX4D = "a table of cameras of RealityCapture (RealityScan)", "cameras of Pix4D"
 
+_AS_TEXT = (
+    b"changed by a transfer as text"  # what `_head` adds to binary files all of whose line ends are CR LF
+)
+_AGAIN = "get it again as binary (FTP: binary mode; git: `*.ply binary` in .gitattributes)"
+
+_UNFINISHED = "*.crdownload *.part *.partial *.download *.opdownload *.aria2 *.!ut *.filepart"
+
 SIGNS = (
+    Sign("an unfinished download", "wait until it is complete, or download it again", names=_UNFINISHED),
+    Sign("damaged by a transfer as text, which made each line end CR LF", _AGAIN, words=(_AS_TEXT,)),
     Sign("a pointer of Git LFS, not the file itself", "`git lfs pull` gets it", (b"version https://git-lfs",)),
-    Sign("an HTML page, not the file itself", "download the file that it links to", (b"<!doctype html", b"<html")),
-    Sign("an HTML page, not the file itself", "download the file that it links to", (b"<?xml",), (b"<html",)),
+    Sign("a viewer's page with a scene inside (SuperSplat)", _EDITOR, (b"<!doctype html", b"<html"), (b"supersplat",)),
+    Sign("an HTML page, not the file itself", _LINK, (b"<!doctype html", b"<html")),
+    Sign("an HTML page, not the file itself", _LINK, (b"<?xml",), (b"<html",)),
+    Sign("a network of Scaffold-GS or a relative", _HIDDEN, names="color_mlp.pt cov_mlp.pt opacity_mlp.pt"),
     Sign("a checkpoint of nerfstudio", _NERF, (_ZIP,), (b"data.pkl", b"gauss_params")),
     Sign("a checkpoint of 3dgrut", _GRUT, (_ZIP,), (b"data.pkl", b"features_albedo")),
     Sign("a checkpoint of gsplat", _GSPLAT, (_ZIP,), (b"data.pkl", b"splats")),
@@ -146,6 +161,29 @@ SIGNS = (
     _poses("a trajectory of a SLAM program (TUM: time tx ty tz qx qy qz qw)", b"numbers:8 unit", todo=_REGISTER),
     _poses("a trajectory of a SLAM program (KITTI: 3×4 matrices)", b"numbers:12 rigid", todo=_REGISTER),
     _poses("a trajectory of EuRoC", b"#timestamp", b"q_rs_w", todo=_EUROC),
+    Sign("a project of Postshot", _EDITOR, names="*.psht"),
+    Sign("a project of CloudCompare", SCAN, (b"CCB",)),
+    _poses("a project of Pix4D in OPF", b"application/opf-"),
+    _poses("a table of photos of OpenSfM (OpenDroneMap)", b'"FeatureCollection"', b'"filename"', b'"translation"'),
+    _poses("a capture of Record3D", b'"poses"', b'"K"', b'"fps"', todo="`ns-process-data record3d` converts it"),
+    _poses("a capture of Record3D", names="*.r3d", todo="`ns-process-data record3d` converts it"),
+    Sign("a camera path of nerfstudio's viewer", _PATH, words=(b'"camera_path"', b'"camera_to_world"')),
+    Sign("a camera path of SuperSplat", _PATH, words=(b'"camera"', b'"poseSets"')),
+    Sign("a point cloud of Potree", _LAS, words=(b'"octreeDir"',)),
+    Sign("a point cloud of Potree", _LAS, words=(b'"hierarchy"', b'"stepSize"', b'"encoding"')),
+    Sign("a point cloud in EPT (Entwine)", "`pdal translate ept.json cloud.laz` converts it", words=(b'"hierarchyType"', b'"schema"')),
+    Sign("a part of a point cloud of Potree", _LAS, names="octree.bin hierarchy.bin"),
+    Sign("a scene layer of ArcGIS (I3S)", SCAN, names="*.slpk *.i3s"),
+    Sign("a drawing", SCAN, names="*.dxf *.dwg *.skp *.ifc *.step *.stp *.igs *.3dm"),
+    Sign("a grid of heights (ESRI)", "`gdal2xyz.py` makes points of it, which have no colours", words=(b"ncols", b"nrows", b"cellsize")),
+    Sign("an array of NumPy", _SAVETXT, names="[!p]*.npy p[!o]*.npy po[!s]*.npy pos[!e]*.npy poses.npy"),
+    Sign("a database of features of COLMAP, without poses", "give the folder of a model, such as sparse/0", names="*.db"),
+    Sign("a project of OpenMVS or MeshLab", _COLMAP, names="*.mvs *.mlp"),
+    Sign("a camera path of instant-ngp", _PATH, words=(b'"path"', b'"aperture_size"')),
+    Sign("a data set of another program", SCAN, names="*.h5 *.hdf5 *.parquet *.arrow *.tfrecord"),
+    Sign("a tileset of 3D Tiles, for viewers such as CesiumJS", "give the scene that it was made of, or one of its .glb tiles", words=(b'"geometricError"', b'"root"')),
+    Sign("a recording of sensors", SCAN, names="*.mcap *.db3 *.pcap *.pcapng *.svo *.svo2 *.rosbag *.lvx *.lvx2"),
+    Sign("a hierarchy of Gaussians", "export a .ply with the program that trained it", names="*.hier *.hier_opt"),
     Sign("an LCC scene of XGRIDS", "`splat-transform scene.lcc scene.ply` (npm: @playcanvas/splat-transform) converts it", names="*.lcc"),
     Sign("a RAD scene of Spark", "convert the .ply, .spz or .sog that Spark built it from", names="*.rad"),
     Sign("a PTX scan of Leica", "`CloudCompare -O cloud.ptx -C_EXPORT_FMT PLY -SAVE_CLOUDS` converts it with its colours", names="*.ptx"),
@@ -194,7 +232,12 @@ def _head(path: Path) -> bytes:
     elif b"\0" not in head:
         head = head.removeprefix(b"\xef\xbb\xbf").lstrip()
         head += _shape(head)
+    elif _FEWEST_LINES <= head.count(b"\n", head.index(0)) == head.count(b"\r\n", head.index(0)):
+        head += _AS_TEXT
     return head
+
+
+_FEWEST_LINES = 4  # line ends in binary data that are not CR LF by chance
 
 
 def _shape(head: bytes) -> bytes:

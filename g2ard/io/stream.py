@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
@@ -231,10 +232,17 @@ class PointStream(Stream[RawPoints]):
         """
         positions, values, noise = sample
         good = np.isfinite(positions).all(axis=1) & ~noise
-        self.sample = positions[good]
-        low, high = np.percentile(self.sample, (1, 99), axis=0) if good.any() else np.zeros((2, 3))
+        placed = good & positions.any(axis=1)
+        low, high = np.percentile(positions[placed], (1, 99), axis=0) if placed.any() else np.zeros((2, 3))
         middle, extent = (low + high) / 2, high - low
         far = np.isfinite(middle).all() and (np.abs(middle) > np.linalg.norm(extent)).any()
+        zeros = int(np.count_nonzero(good & ~placed))
+        away = bool((np.abs(middle) > _FAR * np.linalg.norm(extent)).any() and extent.any())
+        self._zeros_are_lost = away or zeros > max(_FEW_BLACK, _BLACK_SHARE * len(good))
+        good = placed if self._zeros_are_lost and placed.any() else good
+        self.sample = positions[good]
+        wide = np.sort(extent)[1:].prod()
+        notes = (*notes, *judge.coarse(self.sample, math.sqrt(wide / max(1, count))))
         notes = (*notes, _DEGREES) if _in_degrees(middle, extent) else notes
         super().__init__(path, count, np.rint(middle) if far else None, notes, "point")
         self.channels, self.scales = values.shape[1], scales
@@ -262,6 +270,11 @@ class PointStream(Stream[RawPoints]):
     @abstractmethod
     def raw(self, rows: int, start: int) -> Iterator[MarkedPoints]:
         """Yield the source's points from `start`, at most `rows` at a time."""
+
+    def marked(self, rows: int, start: int) -> Iterator[MarkedPoints]:
+        """Yield `raw` with points as noise that scanners store at 0 0 0 for want of a return."""
+        for positions, values, noise in self.raw(rows, start):
+            yield positions, values, noise | ~positions.any(axis=1) if self._zeros_are_lost else noise
 
     def header_notes(self) -> tuple[Note, ...]:
         notes, (dark, full) = list(self.notes), self._range
@@ -291,13 +304,13 @@ class PointStream(Stream[RawPoints]):
             return (positions - self.offset).astype(np.float32)
 
     def positions(self, rows: int) -> Iterator[NDArray[np.float32]]:
-        for positions, _, noise in self.raw(rows, 0):
+        for positions, _, noise in self.marked(rows, 0):
             near = self.near(positions)
             near[noise] = np.nan
             yield near
 
     def blocks(self, rows: int, start: int = 0) -> Iterator[RawPoints]:
-        for positions, values, noise in self.raw(rows, start):
+        for positions, values, noise in self.marked(rows, start):
             good = self.tally.keep(positions, values, noise)
             positions, values = (positions, values) if good.all() else (positions[good], values[good])
             colors = self.shown(values)
@@ -402,7 +415,7 @@ class JoinedClouds(Joined[RawPoints], PointStream):
 
     def raw(self, rows: int, start: int) -> Iterator[MarkedPoints]:
         for number, begin in from_row([stream.count for stream in self.streams], start):
-            yield from self.streams[number].raw(rows, begin)
+            yield from self.streams[number].marked(rows, begin)
 
     def blocks(self, rows: int, start: int = 0) -> Iterator[RawPoints]:
         for number, begin in from_row([stream.count for stream in self.streams], start):

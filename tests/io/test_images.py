@@ -12,7 +12,7 @@ from PIL import Image
 
 from g2ard.errors import InputError, OutputError
 from g2ard.io.finding import Finder
-from g2ard.io.images import contact_sheet, load_mask, load_photo, to_bytes, write_png
+from g2ard.io.images import load_mask, load_photo, to_bytes, write_png
 from g2ard.io.photos import unreadable
 from g2ard.scene.cameras import Cameras
 from helpers.scenes import around
@@ -139,20 +139,6 @@ def test_png_round_trip(tmp_path: Path) -> None:
         write_png(tmp_path / "a.png", image)
     with pytest.raises(InputError, match="expected an image"):
         write_png(tmp_path / "b.png", np.zeros((2, 3, 5)))
-
-
-def test_contact_sheet_holds_its_images() -> None:
-    rng = np.random.default_rng(0)
-    rows = [[rng.random((20, 30, 3)) for _ in range(3)], [rng.random((10, 30, 3))]]
-    labels = ["photo", "simplified", "recovered"]
-    sheet = contact_sheet(rows, labels, row_labels=["one", "two"])
-    assert sheet.dtype == np.uint8
-    for image in (*rows[0], *rows[1]):
-        windows = np.lib.stride_tricks.sliding_window_view(sheet, image.shape)[:, :, 0]
-        assert (windows == to_bytes(image)).all((2, 3, 4)).sum() == 1
-    assert contact_sheet(rows, labels).shape[0] < sheet.shape[0]
-    with pytest.raises(InputError, match="needs images"):
-        contact_sheet([], ["photo"])
 
 
 @pytest.mark.parametrize("value", [1.94, -0.1, np.nan])

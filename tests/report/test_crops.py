@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from g2ard.io.images import contact_sheet
 from g2ard.rendering.targets import TeacherRenders
 from g2ard.report import distilled
 from g2ard.report.page import Page, Shown, pixels, worst_windows
+from g2ard.report.sheet import contact_sheet
 from g2ard.stages.evaluate import evaluate
 from helpers.scenes import around, checkered_ball
 from helpers.studies import check_page

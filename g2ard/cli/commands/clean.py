@@ -132,9 +132,10 @@ def _paint(path: Path, done: Cleaned, cameras: Cameras, overwrite: bool) -> None
     """Write up to three views of the scene, its clutter coloured by kind on grey, and the result."""
     import numpy as np
 
-    from g2ard.io.images import contact_sheet, write_png
+    from g2ard.io.images import write_png
     from g2ard.jobs.clean import painted
     from g2ard.rendering.renderer import Renderer
+    from g2ard.report.sheet import contact_sheet
     from g2ard.scene.samples import evenly_spaced
 
     colors = np.array([*(color for _, color in _COLORS.values()), _GREY])[done.clutter.kind]

@@ -204,7 +204,8 @@ def _write_sheet(
     path: Path, images: list[NDArray[np.uint8]], names: tuple[str, ...], overwrite: bool
 ) -> None:
     """Write a roughly square grid of all images, captioned by row."""
-    from g2ard.io.images import contact_sheet, write_png
+    from g2ard.io.images import write_png
+    from g2ard.report.sheet import contact_sheet
 
     columns = math.ceil(math.sqrt(len(images)))
     rows = [images[i : i + columns] for i in range(0, len(images), columns)]
