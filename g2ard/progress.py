@@ -61,11 +61,14 @@ def show_progress(stage: str, done: int, total: int, info: Mapping[str, Any] | N
     >>> small = g2ard.distill("scene.ply", ratio=10, progress=g2ard.show_progress)  # doctest: +SKIP
     """
     now, ended, shell = time.monotonic(), 0 < total <= done, kernel()
+    if shell is None and sys.stderr is None:  # a program without a console
+        return
+    terminal = getattr(sys.stderr, "isatty", bool)()
     if stage != _line.stage:
         _line.stage, _line.began, _line.drawn = stage, now, 0.0
     if ended and shell is None:
         print(f"\r{'':{_WIDTH}}\r", end="", file=sys.stderr, flush=True)
-    elif ended or now - _line.drawn >= (0.1 if sys.stderr.isatty() else 1):
+    elif ended or now - _line.drawn >= (0.1 if terminal else 1):
         _line.drawn = now
         text = f"{stage}: {done:,}/{total:,}" if total > 1 else stage
         if shell is not None and total > 1:

@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 from collections.abc import Iterable
 from functools import partial
 from pathlib import Path
@@ -11,9 +12,11 @@ import typer
 
 from g2ard.cli.budget_options import Count
 from g2ard.cli.usage import meant
+from g2ard.errors import InputError
 
 _NOT_KEPT = ("config", "print_config", "overwrite", "resume")
 """Options that are not written to config files."""
+_BACKSLASHES = "; within double quotes \\ begins an escape: write paths in single quotes, or with /"
 _toml = partial(json.dumps, ensure_ascii=False)
 """Format a value; for text, finite numbers and lists of them, TOML is JSON."""
 
@@ -53,14 +56,16 @@ def load_config(ctx: typer.Context, path: Path | None) -> Path | None:
 def _read(path: Path) -> dict[str, Any]:
     import tomllib
 
+    from g2ard.io.paths import read_text
+
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8-sig"))
-    except OSError as e:
-        raise typer.BadParameter(f"{path}: {e.strerror}") from None
-    except UnicodeDecodeError:
-        raise typer.BadParameter(f"{path}: not a text file") from None
+        text = read_text(path)
+        return tomllib.loads(text)
+    except InputError as e:
+        raise typer.BadParameter(str(e)) from None
     except tomllib.TOMLDecodeError as e:
-        raise typer.BadParameter(f"{path}: {e}") from None
+        hint = _BACKSLASHES if re.search(r'"[^"\n]*\\', text) else ""
+        raise typer.BadParameter(f"{path}: {e}{hint}") from None
 
 
 def _parameters(ctx: typer.Context, path: Path, tables: Iterable[str]) -> dict[str, dict[str, Any]]:
@@ -125,6 +130,8 @@ def _flat(table: Any, prefix: str = "") -> dict[str, Any]:
 
 def _as_typed(value: Any) -> Any:
     """Return a TOML value as typed on the command line, such as 1,1,1 for [1, 1, 1]."""
+    if isinstance(value, str) and not value.isprintable():
+        raise typer.BadParameter(f"{value!r} holds control characters{_BACKSLASHES}")
     if isinstance(value, list):
         return ",".join(str(item) for item in value)
     return str(value).lower() if isinstance(value, bool) else str(value)

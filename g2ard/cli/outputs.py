@@ -71,7 +71,8 @@ class Outputs:
     ) -> None:
         self._pattern, self._budgets, self._check, self._name = str(pattern), budgets, check, name
         self._checked: set[Path] = set()
-        if strange := set(re.findall(r"{[^{}]*}", self._pattern)) - {"{ratio}", "{count}"}:
+        words = set(re.findall(r"{[a-z_]*}", pattern.name))  # braces elsewhere, as of a GUID, mean themselves
+        if strange := words - {"{ratio}", "{count}"}:
             raise typer.BadParameter(
                 f"{name}: unknown placeholder {min(strange)}; use {{ratio}} or {{count}}"
             )

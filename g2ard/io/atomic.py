@@ -153,10 +153,10 @@ def hidden_name(name: str, ending: str) -> str:
     >>> hidden_name("a.ply", ".tiles"), len(hidden_name(250 * "a", ".tiles"))
     ('.a.ply.tiles', 255)
     """
-    room = _LONGEST_NAME - len(f".{ending}".encode())
-    if len(name.encode()) > room:
-        digest = sha256(name.encode()).hexdigest()[:16]
-        name = name.encode()[: max(0, room - len(digest))].decode(errors="ignore") + digest
+    room, data = _LONGEST_NAME - len(os.fsencode(f".{ending}")), os.fsencode(name)
+    if len(data) > room:
+        digest = sha256(data).hexdigest()[:16]
+        name = data[: max(0, room - len(digest))].decode(errors="ignore") + digest
     return f".{name}{ending}"
 
 

@@ -1,6 +1,7 @@
 """Reader for laser scans, .e57, with pye57: their points, and their photos as views."""
 
 import hashlib
+import os
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -281,4 +282,4 @@ def _cache_of(path: Path) -> Path:
     """Return the folder of a file's photos below the user's cache folder; another file has another one."""
     state = path.stat()
     key = f"{path.resolve()}\n{state.st_size}\n{state.st_mtime_ns}"
-    return user_cache() / "e57" / f"{path.stem}-{hashlib.sha256(key.encode()).hexdigest()[:16]}"
+    return user_cache() / "e57" / f"{path.stem}-{hashlib.sha256(os.fsencode(key)).hexdigest()[:16]}"

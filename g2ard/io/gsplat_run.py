@@ -46,7 +46,8 @@ def read(views: ViewFiles) -> Listed:
         )
     named, data = settings.path("data_dir"), data_of(path)
     if named is None or data is None:
-        raise InputError(f"data_dir {named and named.as_posix()} does not exist", path=file)
+        text = f"data_dir {named and named.as_posix()} does not exist"
+        raise InputError(text, path=file, hint="give its COLMAP folder as views, or correct data_dir")
     smaller = data / f"images_{settings.word('data_factor')}"
     photos = images or (smaller if smaller.is_dir() else None)
     try:

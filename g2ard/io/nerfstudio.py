@@ -76,7 +76,8 @@ def _data(views: ViewFiles, settings: Settings | None) -> tuple[Sequence[Frame],
     parser, options, data = _parser(folder / CONFIG, settings)
     place = below(folder / CONFIG, data)
     if place is None:
-        raise InputError(f"data {data.as_posix()} does not exist", path=folder / CONFIG)
+        hint = f"give its transforms.json or COLMAP folder as views, or correct `data` in {CONFIG}"
+        raise InputError(f"data {data.as_posix()} does not exist", path=folder / CONFIG, hint=hint)
     if parser == "ColmapDataParser":
         model = place / (options.path("colmap_path") or "colmap/sparse/0")
         photos = views.images or place / (options.path("images_path") or "images")

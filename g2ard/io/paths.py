@@ -5,6 +5,7 @@ import hashlib
 import os
 import re
 import sys
+import tempfile
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from pathlib import Path, PurePosixPath, PureWindowsPath
@@ -138,4 +139,9 @@ def content_hash(path: Path) -> str:
 def user_cache() -> Path:
     """Return the folder in the user's cache for what can be made again or done without."""
     usual = os.environ.get("LOCALAPPDATA") if sys.platform == "win32" else os.environ.get("XDG_CACHE_HOME")
-    return (Path(usual) if usual else Path.home() / ".cache") / "g2ard"
+    try:
+        cache = (Path(usual) if usual else Path.home() / ".cache") / "g2ard"
+        cache.mkdir(parents=True, exist_ok=True)
+    except (OSError, RuntimeError):  # in a container, there may be no home, or only to read
+        return Path(tempfile.gettempdir()) / "g2ard"
+    return cache

@@ -28,6 +28,12 @@ _QUATS = ["rot_0", "rot_1", "rot_2", "rot_3"]
 _REQUIRED_PROPERTIES = [*_MEANS, *_DC, "opacity", *_SCALES, *_QUATS]
 _NORMALS = ["nx", "ny", "nz"]
 _FILTER = "filter_3d"
+_TIME = re.compile(
+    r"t|time\w*|\w*_t|trbf\w*|motion\w*|omega\w*|rot_r_?\d|vel\w*|v[xyz]|(start|end)_time|dur\w*"
+)
+_DEFORMS = ("deformation.pth", "../../deform")
+"""Names of properties of scenes that move, and of networks beside a scene that move it."""
+
 _JUDGED = 4096  # rows that tell how values are stored
 _FLAT_LOG_RATIO = np.log(np.float32(1e-3))
 """Logarithm of the thickness of 2D Gaussians over their shorter scale."""
@@ -66,7 +72,12 @@ class Stream(RawStream):
             sample = plyfiles.spread_rows(rows)
             shift = far_middle(np.stack([sample[names[name]] for name in _MEANS], axis=1))
         offset = plyfiles.offset_of(path, header) + shift
+        moving = [name for name in names if _TIME.fullmatch(name)]
+        moving += [name for name in _DEFORMS if (path.absolute().parent / name).exists()]
         notes = [*_frames(header), *_ignored([n for n in names if n not in needed], rest, stored, kept)]
+        if moving:
+            text = f"the scene moves in time ({', '.join(moving[:3])}); all times are read as one"
+            notes.append(Note("moving", len(moving), text))
         if flat:
             text = "2DGS scene read as flat Gaussians; renders differ where surfaces are seen at a slant"
             notes.append(Note("flat_gaussians", len(rows), text))

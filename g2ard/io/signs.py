@@ -222,7 +222,7 @@ def _head(path: Path) -> bytes:
     if head.startswith(_ZIP):
         with suppress(Exception), zipfile.ZipFile(path) as bundle:
             names = bundle.namelist()
-            head = head[:4] + "\n".join(names).encode()
+            head = head[:4] + "\n".join(names).encode(errors="replace")
             for name in (name for name in names if name.endswith("data.pkl")):
                 with bundle.open(name) as member:
                     head += member.read(_HEAD)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 from pathlib import Path, PurePosixPath, PureWindowsPath
 
+from g2ard.io.finding import plain_parts
 from g2ard.io.paths import read_text, real_path
 
 _PATH = re.compile(r"(?:&(?P<anchor>\w+)\s+)?!!python/object/apply:pathlib\.(?P<kind>\w*)Path\s*(?:\[\])?$")
@@ -88,12 +89,14 @@ def read_settings(path: Path) -> Settings:
 def below(start: Path, path: Path) -> Path | None:
     """Resolve a path that a trainer wrote into `start`, or return None if it does not exist.
 
-    Trainers write paths relative to where they ran, usually a folder above their output.
+    Trainers write paths relative to where they ran, usually a folder above their output. Of a run that was
+    copied with its data from another system, the longest end of the path that exists there is taken.
     """
-    if path.is_absolute():
-        return path if path.exists() else None
-    places = (*real_path(start).parents, Path())
-    return next((place / path for place in places if (place / path).exists()), None)
+    folders, parts = real_path(start).parents, plain_parts(str(path))
+    if found := next((place / path for place in (*folders, Path()) if (place / path).exists()), None):
+        return found
+    ends = (place.joinpath(*parts[k:]) for k in range(len(parts)) for place in (*folders, Path()))
+    return next((end for end in ends if end.exists() and real_path(end) not in folders), None)
 
 
 def _indent(line: str) -> int:

@@ -180,4 +180,4 @@ class Page:
     def write(self, path: Path, overwrite: bool = True) -> None:
         """Write the page atomically."""
         with atomic_output(path, overwrite) as temporary:
-            temporary.write_text(self.text(), encoding="utf-8", newline="\n")
+            temporary.write_text(self.text(), encoding="utf-8", errors="replace", newline="\n")

@@ -180,7 +180,11 @@ class _Pool:
         self._pool: concurrent.futures.Executor | None = None
 
     def run(self, tasks: Sequence[Task], told: Told) -> None:
-        self._pool = self._pool or self._opened()
+        try:
+            self._pool = self._pool or self._opened()
+        except (OSError, ImportError) as error:  # of semaphores
+            text = f"processes cannot be started ({error}): they need a /dev/shm that can be written to"
+            raise InputError(text, hint="--workers 1 needs none") from error
         try:
             asked = self._threads, program()
             futures = {self._pool.submit(_work, task.absolute(), *asked): task for task in tasks}

@@ -132,7 +132,7 @@ def write_globe_page(
 
 def _write(path: Path, text: str, overwrite: bool) -> int:
     with atomic_output(path, overwrite) as temporary:
-        temporary.write_text(text, encoding="utf-8", newline="\n")
+        temporary.write_text(text, encoding="utf-8", errors="replace", newline="\n")
         return temporary.stat().st_size
 
 
