@@ -25,6 +25,9 @@ from helpers.commands import CommandLine, refused, succeeds
         ("n = 9", "has no option n (write count)"),
         ("[simplify]\nmin-psnr = true", "'--min-psnr': expected a number of at least 1, got 'true'"),
         ("[simplify\n", "c.toml: "),
+        ('[simplify]\nratio = 4\noutput = "C:\\Users\\me\\s.ply"', "write paths in single quotes"),
+        ('[simplify]\nratio = 4\noutput = "D:\\scans\\s.ply"', "write paths in single quotes"),
+        ('[simplify]\nratio = 4\noutput = "C:\\temp\\new.ply"', "write paths in single quotes"),
     ],
 )
 def test_wrong_names_and_values_are_named(
@@ -33,6 +36,16 @@ def test_wrong_names_and_values_are_named(
     (folder / "c.toml").write_text(text)
     ask = ("simplify", "ball.ply", "-o", "s.ply", "--config", "c.toml")
     assert words in refused(command_line, folder, *ask)
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "utf-16-le"])
+@pytest.mark.parametrize("end", ["\n", "\r\n"])
+def test_config_files_of_windows(command_line: CommandLine, folder: Path, encoding: str, end: str) -> None:
+    text = end.join(["[simplify]", "ratio = [10]", "output = 's.ply'", ""])
+    mark = "\ufeff" if encoding == "utf-16-le" else ""
+    (folder / "c.toml").write_bytes((mark + text).encode(encoding))
+    succeeds(command_line, folder, "simplify", "ball.ply", "--config", "c.toml")
+    assert (folder / "s.ply").is_file()
 
 
 def test_keys_above_tables_apply_to_every_command(command_line: CommandLine, folder: Path) -> None:

@@ -156,3 +156,9 @@ def test_a_pictures_suffix_is_of_any_case(command_line: CommandLine, folder: Pat
     succeeds(command_line, folder, "render", "ball.ply", "-k", 1, "--size", 32, "--sheet", "a.PNG")
     with Image.open(folder / "a.PNG") as picture:
         assert picture.format == "PNG"
+
+
+@pytest.mark.parametrize("name", ["{1A2B-3C}/s.ply", "{backup}/s.ply", "s{v2}.ply", "{A}_{ratio}x.ply"])
+def test_braces_that_are_no_placeholders(command_line: CommandLine, folder: Path, name: str) -> None:
+    succeeds(command_line, folder, "simplify", "ball.ply", "-r", "4", "-o", name)
+    assert (folder / name.replace("{ratio}", "4")).is_file()

@@ -325,6 +325,69 @@ def test_a_cloud_of_nothing_moves_no_other(tmp_path: Path, rest: str, suffix: st
     assert ("map_systems" in [note.code for note in stream.header_notes()]) == (rest == "strays")
 
 
+@pytest.mark.parametrize("suffix", ["ply", "e57", "xyz", "pcd"])  # .las stores differences from FAR
+@pytest.mark.parametrize("at", [FAR, np.zeros(3)], ids=["far", "near"])
+@pytest.mark.parametrize("zeros", [1, 900])
+def test_points_without_a_return_are_dropped(tmp_path: Path, suffix: str, at: np.ndarray, zeros: int) -> None:
+    """One point at 0 0 0 of a cloud about the origin may be a point."""
+    rng = np.random.default_rng(0)
+    positions, rgb = at.round() + rng.normal(0, 9, (3000, 3)).round(3), rng.integers(1, 65535, (3000, 3))
+    lost = rng.permutation(3000) < zeros
+    positions[lost] = 0
+    path = tmp_path / f"a.{suffix}"
+    if suffix in STORED:
+        stored(path, positions, rgb, np.full(3000, 7))
+    else:
+        head = "FIELDS x y z r g b\nSIZE 8 8 8 2 2 2\nTYPE F F F U U U\nPOINTS 3000\nDATA ascii\n"
+        rows = "\n".join(" ".join(f"{v:.9g}" for v in row) for row in np.hstack([positions, rgb]))
+        path.write_text(head * (suffix == "pcd") + rows + "\n")
+    found = read_cloud(path)
+    dropped = zeros if zeros > 1 or at.any() or suffix == "e57" else 0
+    assert len(found.points) == 3000 - dropped
+    assert sum(note.count for note in found.notes if note.code == "noise") == dropped
+    near = np.concatenate(list(stream_of([path, path]).positions(500)))
+    assert np.count_nonzero(np.isnan(near[:, 0])) == 2 * dropped
+
+
+def test_zeros_of_a_scan_with_a_pose_are_at_the_scanner(tmp_path: Path) -> None:
+    fields = {f"cartesian{axis}": np.arange(9.0) // 3 for axis in "XYZ"}
+    fields |= {f"color{name}": np.arange(9.0) for name in ("Red", "Green", "Blue")}
+    with pye57.E57(str(tmp_path / "a.e57"), mode="w") as file:
+        file.write_scan_raw(fields, translation=np.array([100.0, 200, 300]))
+    assert len(read_cloud(tmp_path / "a.e57").points) == 6
+
+
+GRID = np.stack(np.meshgrid(np.arange(50.0), np.arange(50.0)), -1).reshape(-1, 2)
+HEIGHT = np.sin(GRID.sum(axis=1))[:, None]
+
+
+@pytest.mark.parametrize("type_", ["f4", "f8"])
+@pytest.mark.parametrize(
+    ("positions", "coarse"),
+    [
+        (np.hstack([0.2 * GRID, HEIGHT]) + FAR, True),  # 0.2 m apart, half a metre of float32
+        (np.hstack([0.2 * GRID, HEIGHT]) + np.array([4e6, 5e5, 4.8e6]), True),  # ECEF
+        (np.hstack([GRID, HEIGHT]), False),
+        (np.hstack([100 * GRID, HEIGHT]) + FAR, False),  # float32 suffices
+        (np.hstack([0.001 * GRID, HEIGHT / 1000]), False),
+    ],
+)
+def test_coordinates_that_float32_rounds_are_told(
+    tmp_path: Path, positions: np.ndarray, coarse: bool, type_: str
+) -> None:
+    rows = np.hstack([positions, np.full((2500, 3), 7)])
+    found = read_cloud(ply(tmp_path / "a.ply", columns(type_, "u1"), rows))
+    assert ("coarse_positions" in [note.code for note in found.notes]) == (coarse and type_ == "f4")
+
+
+def test_whole_metres_are_not_those_of_float32(tmp_path: Path) -> None:
+    """A grid of heights: x and y are whole, z has millimetres."""
+    rows = np.hstack([GRID + FAR[:2].round(), (HEIGHT + FAR[2]).round(3), np.full((2500, 3), 7)])
+    np.savetxt(tmp_path / "a.xyz", rows, fmt="%.3f")
+    found = read_cloud(tmp_path / "a.xyz")
+    assert "coarse_positions" not in [note.code for note in found.notes]
+
+
 def systems(path: Path, code: int | None, wkt: str | None) -> Path:
     header = laspy.LasHeader(point_format=7, version="1.4")
     if code:

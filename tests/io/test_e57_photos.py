@@ -183,3 +183,18 @@ def test_a_scan_and_its_panoramas_distil_from_one_command(tmp_path: Path, comman
     ask = ("--views", "a.e57", "--photos", "-n", 9, "--steps", 3, "--size", 40, "-o", "run")
     succeeds(command_line, tmp_path, "distill", "a.e57", *ask)
     assert len(g2ard.load(tmp_path / "run" / "scene.ply")) == 9
+
+
+@pytest.mark.parametrize("home", ["file", "none"])
+def test_a_home_that_cannot_be_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, home: str) -> None:
+    path = written(tmp_path / "a.e57", posed("pinhole", 0))
+    monkeypatch.delenv("XDG_CACHE_HOME")
+    monkeypatch.setattr("tempfile.gettempdir", lambda: str(tmp_path / "temporary"))
+    (tmp_path / "home").write_bytes(b"")
+    if home == "file":
+        monkeypatch.setattr(Path, "home", lambda: tmp_path / "home")
+    else:
+        monkeypatch.setattr(Path, "home", classmethod(lambda _: (_ for _ in ()).throw(RuntimeError)))
+    (photo,) = read_views(path).image_paths
+    assert photo is not None
+    assert photo.is_relative_to(tmp_path / "temporary" / "g2ard")

@@ -178,3 +178,22 @@ def test_a_folder_with_a_few_of_the_names_holds_other_photos(tmp_path: Path) -> 
         (tmp_path / "new" / names[held - 1]).write_bytes(b"photo")
         found = Finder.among(names, [tmp_path / "images"], [tmp_path])
         assert (found.find(names[0]) is not None) == (held >= 4)
+
+
+@pytest.mark.parametrize("turned", [False, True])
+@pytest.mark.parametrize(
+    ("listed", "stored"),
+    [
+        ("my%20photo%200.png", "my photo 0.png"),
+        ("K%C3%BCche%200.png", "K\u00fcche 0.png"),
+        ("2024-05-01T12:00:0.png", "2024-05-01T12_00_0.png"),
+        ("what? 0.png", "what_ 0.png"),
+    ],
+)
+def test_escapes_of_addresses_and_letters_that_windows_lacks(
+    tmp_path: Path, listed: str, stored: str, turned: bool
+) -> None:
+    listed, stored = (stored, listed) if turned else (listed, stored)
+    photo(tmp_path / stored)
+    photo(tmp_path / "other.png")
+    assert Finder(tmp_path).find(f"images/{listed}") == tmp_path / stored

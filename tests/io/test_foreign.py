@@ -12,10 +12,13 @@ import pytest
 from PIL import Image
 
 from g2ard.errors import InputError
-from g2ard.io import kind
+from g2ard.io import kind, write_splats
 from g2ard.io.signs import SIGNS, Sign, sign_of
+from g2ard.io.source import Source
 from g2ard.io.views import read_view_set
+from helpers.cloud_files import las
 from helpers.opened import read_scene
+from helpers.ply_files import scene
 from helpers.view_files import colmap, orbit
 
 TILESET = {"asset": {"version": "1.1"}, "geometricError": 9, "root": {"children": []}}
@@ -142,3 +145,48 @@ def test_a_splat_of_impossible_values_is_refused(tmp_path: Path, what: str) -> N
     )
     with pytest.raises(InputError, match=r"is not a \.splat"):
         read_scene(tmp_path / "a.splat")
+
+
+BINARY = ["ply", "compressed.ply", "splat", "spz", "sog", "glb", "las", "laz", "pcd"]
+
+
+def as_text(data: bytes) -> bytes:
+    """Return what FTP's text mode and git's autocrlf make of a file."""
+    return data.replace(b"\r\n", b"\n").replace(b"\n", b"\r\n")
+
+
+@pytest.mark.parametrize(
+    "name", ["a.ply", "a.compressed.ply", "a.splat", "a.spz", "a.sog", "a.glb", "a.las", "a.laz", "a.pcd"]
+)
+def test_files_that_a_transfer_changed_are_refused(tmp_path: Path, name: str) -> None:
+    truth, path = scene(3000, 0), tmp_path / name
+    if path.suffix in (".las", ".laz"):
+        las(path, truth.means, np.full((3000, 3), 7))
+    elif path.suffix == ".pcd":
+        head = b"FIELDS x y z r g b\nSIZE 4 4 4 4 4 4\nTYPE F F F F F F\nPOINTS 3000\nDATA binary\n"
+        path.write_bytes(head + np.hstack([truth.means, truth.means]).astype("<f4").tobytes())
+    else:
+        write_splats(path, truth)
+    source = Source(path)
+    assert source.count == 3000
+    (tmp_path / "b").mkdir()
+    changed = tmp_path / "b" / name
+    changed.write_bytes(as_text(path.read_bytes()))
+    with pytest.raises(InputError, match=r"transfer as text|damaged"):
+        Source(changed).count
+
+
+@pytest.mark.parametrize("suffix", [" (1)", "", "_1", ".ply (2)", ".download2", ".bak", ".ply.txt"])
+def test_unknown_suffixes_of_known_content(tmp_path: Path, suffix: str) -> None:
+    write_splats(tmp_path / "a.ply", scene())
+    path = (tmp_path / "a.ply").rename(tmp_path / f"b{suffix}")
+    with pytest.raises(InputError, match=r"is a \.ply file.*rename it to b.*\.ply$"):
+        kind(path)
+
+
+@pytest.mark.parametrize("suffix", ["crdownload", "part", "partial", "download", "opdownload"])
+def test_unfinished_downloads(tmp_path: Path, suffix: str) -> None:
+    write_splats(tmp_path / "a.ply", scene())
+    path = (tmp_path / "a.ply").rename(tmp_path / f"a.ply.{suffix}")
+    with pytest.raises(InputError, match="is an unfinished download"):
+        kind(path)

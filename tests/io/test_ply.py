@@ -382,3 +382,28 @@ def test_the_up_direction_of_comments(tmp_path: Path, comments: list[str], up: A
     assert simplify(found, 50, config=SimplifyConfig(method="fast")).splats.up == found.up
     ingest(path, tmp_path / "tiles")
     assert read_splats(tmp_path / "tiles").up == pytest.approx(up)
+
+
+@pytest.mark.parametrize("names", [["t", "scale_t"], ["motion_0"], ["trbf_center"], ["rot_r_0"], ["time"]])
+def test_scenes_that_move_are_told(tmp_path: Path, names: list[str]) -> None:
+    path = save(tmp_path / "a.ply", columns(scene()) | {name: np.ones(20) for name in names})
+    assert [note.code for note in read_scene(path).notes] == ["ignored_properties", "moving"]
+
+
+@pytest.mark.parametrize("beside", ["deformation.pth", "../../deform/iteration_7/deform.pth"])
+def test_networks_that_move_a_scene_are_told(tmp_path: Path, beside: str) -> None:
+    folder = tmp_path / "point_cloud" / "iteration_7"
+    folder.mkdir(parents=True)
+    path = save(folder / "point_cloud.ply", columns(scene()))
+    assert "moving" not in [note.code for note in read_scene(path).notes]
+    (folder / beside).parent.mkdir(parents=True, exist_ok=True)
+    (folder / beside).write_bytes(b"x")
+    path.touch()
+    assert "moving" in [note.code for note in read_scene(path).notes]
+
+
+@pytest.mark.parametrize("far", [0.0, 5.4e6])
+def test_scenes_of_coordinates_that_float32_rounds_are_told(tmp_path: Path, far: float) -> None:
+    cols = columns(scene()) | {"y": scene().means[:, 1] + far}
+    found = read_scene(save(tmp_path / "a.ply", cols))
+    assert ("coarse_positions" in [note.code for note in found.notes]) == (far > 0)

@@ -140,6 +140,30 @@ def test_a_run_with_its_data_elsewhere_and_optimised_poses(tmp_path: Path) -> No
         assert [note.code for note in found.notes if note.code != "no_photos"] == ["optimised_poses"]
 
 
+@pytest.mark.parametrize(
+    ("kind_", "parts"),
+    [
+        ("Windows", ["'C:\\\\'", "Users", "me", "data", "poster"]),
+        ("Posix", ["/", "home", "me", "data", "poster"]),
+    ],
+)
+def test_a_run_that_was_copied_with_its_data(tmp_path: Path, kind_: str, parts: list[str]) -> None:
+    data_of(tmp_path)
+    lines = "\n".join(f"- {part}" for part in parts)
+    run = run_of(tmp_path, data=f"!!python/object/apply:pathlib.{kind_}Path\n{lines}")
+    np.testing.assert_allclose(read_view_set(run).cameras.viewmats[0], trained(POSES[0]), atol=1e-9)
+    (tmp_path / "data").rename(tmp_path / "elsewhere")
+    with pytest.raises(InputError, match=r"does not exist; give its transforms\.json"):
+        read_view_set(run)
+
+
+@pytest.mark.parametrize("root", ["C:\\nerf\\data\\garden", "/home/me/data/garden", "D:/data/garden"])
+def test_a_result_folder_that_was_copied_with_its_data(tmp_path: Path, root: str) -> None:
+    colmap(tmp_path / "data" / "garden", POSES, text=True)
+    path = result_of(tmp_path, data_dir=root)
+    np.testing.assert_allclose(read_view_set(path).cameras.viewmats, POSES, atol=1e-9)
+
+
 def test_a_run_without_config_takes_the_transforms_beside(tmp_path: Path) -> None:
     path = data_of(tmp_path)
     beside = path.parent / "dataparser_transforms.json"
