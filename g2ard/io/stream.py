@@ -405,7 +405,7 @@ class JoinedClouds(Joined[RawPoints], PointStream):
         self.axes = streams[0].axes if len({stream.axes for stream in streams}) == 1 else self.axes
         stated = {stream.system: stream.path.name for stream in reversed(streams) if stream.system}
         if len(stated) > 1:
-            words = ", ".join(f"{name} in {system}" for system, name in stated.items())
+            words = ", ".join(f"{name} in {system}" for system, name in reversed(stated.items()))
             raise InputError(f"several map systems: {words}; project all to one first", path=streams[0].path)
         self.system = next(iter(stated), None)
         self.notes = tuple(_far_apart(streams))

@@ -250,11 +250,7 @@ def lift_tiles(
     whole, done = sum(points.counts), 0
     progress("lift", done, whole)
     for index, count in enumerate(points.counts):
-
-        def lifting(stage: str, done: int, total: int, info: Any = None, before: int = done) -> None:
-            progress(stage, min(before + done, whole), whole)
-
-        splats = _lifted(points, index, cloud, config, lifting)
+        splats = _lifted(points, index, cloud, config)
         for start in range(0, len(splats), _ROWS_AT_ONCE):
             part = splats.take(slice(start, start + _ROWS_AT_ONCE))
             writer.add(packed(part), part.means)
@@ -264,9 +260,7 @@ def lift_tiles(
     return writer
 
 
-def _lifted(
-    points: TileWriter, index: int, cloud: PointStream, config: LiftConfig, progress: Progress
-) -> Splats:
+def _lifted(points: TileWriter, index: int, cloud: PointStream, config: LiftConfig) -> Splats:
     """Lift a tile's points with those of its halo as neighbours."""
     core, halo = (
         np.fromfile(points.folder / name, _POINT_DTYPE) for name in (tile_name(index), halo_name(index))
@@ -274,7 +268,7 @@ def _lifted(
     if not len(core):
         return Splats.create(np.empty((0, 3)), scales=np.empty((0, 3)))
     both = np.concatenate([core, halo])
-    discs, rows = lift_rows(both["far"], both["rgb"], config, progress)
+    discs, rows = lift_rows(both["far"], both["rgb"], config)
     rows = rows[rows < len(core)]
     means = np.ascontiguousarray(core["near"][rows])
     return replace(discs.take(slice(0, len(rows))), means=means, offset=cloud.offset)

@@ -202,7 +202,7 @@ def lod(
         run.console.expect([*stages, ("write", 3.0), ("the page", 1.0)])
         if not tiled:
             stopped.mkdir(parents=True, exist_ok=True)
-        levels = job.run(stopped)
+        levels = job.run(tiling.folder / "steps" if tiled else stopped)
         begun = None  # folder for files of these levels that are begun
         if tiled:
             content = [[getattr(one, "key", one) for one in levels.splats], asdict(rule)]
