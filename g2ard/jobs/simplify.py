@@ -82,11 +82,15 @@ class Reduction:
         if self.given.views is not None and self.config.method == "paper":
             raise InputError("has no effect on the method paper", parameter="views")
         weighed = self.cameras is not None or self.given.views is not None or self.config.method == "default"
+        weighed = weighed and not self.blind
         if isinstance(self.config, Pairs):
-            if self.config.pixel_scale != Pairs.pixel_scale and weighed and not self.blind:
+            if self.config.pixel_scale != Pairs.pixel_scale and weighed:
                 raise InputError("has no effect with views", parameter="simplify.pixel_scale")
-            if self.config.dilation != Pairs.dilation and self.splats.antialiased:
-                raise InputError("has no effect on antialiased scenes", parameter="simplify.dilation")
+            if self.config.edge_weight != Pairs.edge_weight and not weighed:
+                raise InputError("has no effect without views", parameter="simplify.edge_weight")
+            for name in ("edge_weight", "dilation") if self.splats.antialiased else ():
+                if getattr(self.config, name) != getattr(Pairs, name):
+                    raise InputError("has no effect on antialiased scenes", parameter=f"simplify.{name}")
         if self.plan is None:
             say_regions(self.splats, self.config, "the scene", self.say)
         else:

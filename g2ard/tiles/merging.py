@@ -133,7 +133,9 @@ def _merged(
     visibility: list[dict[str, Any]] = (
         [{"visibility": path} for path in sights.visibility] if sights else [{}] * tiles
     )
-    costs = run.each("run_costs", "costs", frame=frame, inputs=visibility)
+    mean_run = max(1.0, sum(run.sizes) / (run.config["morton_premerge_ratio"] * budget))
+    runs: list[dict[str, Any]] = [{"mean_run": mean_run}] * tiles
+    costs = run.each("run_costs", "costs", frame=frame, per_tile=runs, inputs=visibility)
     runs_left, faint = _runs(run, costs, budget)
     ends = plan_ends(runs_left, budget)
     plans = run.each(

@@ -192,14 +192,14 @@ def run_costs(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
     """Compute the costs of merging along Morton order.
 
     Args:
-        arguments: `tile`, `config`, `frame`.
+        arguments: `tile`, `config`, `frame`; `mean_run`, the mean number of rows of a run, over all tiles.
         inputs: `visibility`.
 
     Returns:
         `costs`, (R − 1,) float32, one per gap between the R ordered rows that a renderer draws.
     """
     scene = tile_of(arguments, inputs, places, sh=False)
-    return {"costs": _seen_tile(scene, arguments, inputs).run_costs()}
+    return {"costs": _seen_tile(scene, arguments, inputs).run_costs(arguments["mean_run"])}
 
 
 def pair_plan(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
@@ -397,4 +397,4 @@ class TiledRun:
         sample = self.sample().with_sh_degree(0)
         every = -(-len(sample) // _FRAME_SAMPLE)
         scene, _ = finite_rows_of(sample.take(slice(None, None, every)))
-        return _core.TileFrame.of_sample(scene.core, Default(**self.config)).values()
+        return tuple(_core.TileFrame.of_sample(scene.core, Default(**self.config)).values())

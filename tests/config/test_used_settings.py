@@ -54,6 +54,8 @@ SIMPLIFY: dict[str, Any] = {
     "min_opacity": 0.3,
     "morton_premerge_ratio": 1.5,
     "morton_premerge_steps": 3,
+    "longest_run": 1.0,
+    "edge_weight": 50.0,
     "neighbors": 3,
     "geometric_weight": 0.0,
     "dilation": 2.0,

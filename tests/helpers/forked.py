@@ -30,7 +30,7 @@ def _results() -> Iterator[NDArray[Any]]:
     config = SimplifyConfig().resolved()
     frame = _core.TileFrame.of_sample(scene.core, config)
     yield np.array(frame.values())
-    yield _core.TileMerging(scene.core, frame, config).run_costs()
+    yield _core.TileMerging(scene.core, frame, config).run_costs(2.0)
     yield lift(ball.means, np.full((len(ball), 3), 0.5)).scales
     yield select(ball, views, 3).order
     yield visibility(ball, views).weight

@@ -88,10 +88,10 @@ def test_one_tile_is_the_whole_to_the_bit(seen: bool) -> None:
         frame = frame.with_views(0.01, 1, 1)
         frame = frame.with_views(0.01, *tile(frame).sums())
     here = tile(frame)
-    assert len(here.run_costs()) < len(prepared)  # the transparent are not among them
+    assert len(here.run_costs(2.0)) < len(prepared)  # the transparent are not among them
     rounds = config.rounds(len(prepared), budget)
     counts = [n for n in rounds if n < 3 * budget]
-    of, a, b, costs = here.plan(3 * budget, counts, here.run_costs())
+    of, a, b, costs = here.plan(3 * budget, counts, here.run_costs(2.0))
     assert len(a) == 2 * budget
     assert (costs >= 0).all()
     out = here.assemble(clusters(of, a, b, 3 * budget), budget)

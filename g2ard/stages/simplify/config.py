@@ -96,6 +96,9 @@ class Pairs(SimplifyConfig):
             times √(ratio/10) beyond 10×, and 1 for `fast`.
         morton_premerge_steps: steps of the merging along Morton order, each on a shifted lattice. None means
             1 for `default`, 2 for `fast`.
+        longest_run: longest run of Morton order that merges, in mean runs, so that details that are fine from
+            afar survive; infinity for no limit. None means 6 for `default`, 4 for `fast`.
+        edge_weight: with views: weight of the error of gradients beside that of values, in pixels squared.
         geometric_weight: weight of the coverage error relative to the colour error; halved without views,
             because much of the scene is hidden.
         dilation: standard deviation of the renderer's blur, in pixels. The renderer's is √0.3 ≈ 0.55; 0.4
@@ -113,6 +116,8 @@ class Pairs(SimplifyConfig):
 
     morton_premerge_ratio: Annotated[float, Within("[1, inf]")] | None = None
     morton_premerge_steps: AtLeastOne | None = None
+    longest_run: Annotated[float, Within("[1, inf]")] | None = None
+    edge_weight: Annotated[float, Within("[0, inf]")] = _PAIRWISE["edge_weight"]
     geometric_weight: Annotated[float, Within("[0, inf]")] = _PAIRWISE["geometric_weight"]
     dilation: Annotated[float, Within("[0, inf]")] = _PAIRWISE["dilation"]
     pixel_scale: Positive = _PAIRWISE["pixel_scale"]

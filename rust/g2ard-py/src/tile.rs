@@ -3,7 +3,7 @@
 use g2ard_core::simplify::{Frame, Importance, Pairwise, Tile};
 use numpy::{PyArray1, PyReadonlyArray1};
 use pyo3::prelude::*;
-use pyo3::types::PyDict;
+use pyo3::types::{PyDict, PyTuple};
 
 use crate::arrays;
 use crate::constants::Config;
@@ -21,14 +21,28 @@ pub struct PyFrame(Frame);
 
 #[pymethods]
 impl PyFrame {
+    /// `importance`: exponent, usual mass, the place's three coordinates, reach and angular share.
     #[new]
-    fn new(unit: f64, pixel_size: f32, floor: f32, exponent: f64, usual: f64) -> Self {
-        Self(Frame {
+    #[pyo3(signature = (unit, pixel_size, floor, *importance))]
+    fn new(
+        unit: f64,
+        pixel_size: f32,
+        floor: f32,
+        importance: &Bound<'_, PyTuple>,
+    ) -> PyResult<Self> {
+        let [exponent, usual, x, y, z, reach, angular] = importance.extract()?;
+        Ok(Self(Frame {
             unit,
             pixel_size,
             floor,
-            importance: Importance { exponent, usual },
-        })
+            importance: Importance {
+                exponent,
+                usual,
+                place: [x, y, z],
+                reach,
+                angular,
+            },
+        }))
     }
 
     /// The frame of a fair sample of a scene, without views.
@@ -48,15 +62,18 @@ impl PyFrame {
     }
 
     /// The arguments of the constructor.
-    fn values(&self) -> (f64, f32, f32, f64, f64) {
-        let f = self.0;
-        (
-            f.unit,
-            f.pixel_size,
-            f.floor,
-            f.importance.exponent,
-            f.importance.usual,
-        )
+    fn values(&self) -> Vec<f64> {
+        let Frame {
+            unit,
+            pixel_size,
+            floor,
+            importance,
+        } = self.0;
+        let [x, y, z] = importance.place;
+        let of_scene = [unit, pixel_size.into(), floor.into()];
+        let of_rows = [importance.exponent, importance.usual];
+        let of_place = [x, y, z, importance.reach, importance.angular];
+        [&of_scene[..], &of_rows, &of_place].concat()
     }
 }
 
@@ -109,9 +126,10 @@ impl PyTileMerging {
         self.with(py, |tile| long(py, None, |_| tile.sums()))
     }
 
-    /// Return the cost of closing each gap between neighbours in Morton order, from the first kept row on.
-    fn run_costs<'py>(&self, py: Python<'py>) -> PyResult<Floats<'py>> {
-        let costs = self.with(py, |tile| long(py, None, |_| tile.run_costs()))?;
+    /// Return the cost of closing each gap between neighbours in Morton order, from the first kept row on, for runs of
+    /// `mean_run` rows in the mean over all tiles.
+    fn run_costs<'py>(&self, py: Python<'py>, mean_run: f64) -> PyResult<Floats<'py>> {
+        let costs = self.with(py, |tile| long(py, None, |_| tile.run_costs(mean_run)))?;
         Ok(PyArray1::from_vec(py, costs))
     }
 

@@ -37,9 +37,9 @@ pub struct Frame {
     pub unit: f64,
     /// Pixel size of rows that no view sees.
     pub pixel_size: f32,
-    /// Σ αT² that a unit of mass counts for though no view sees it.
+    /// Σ αT² that a unit of apparent mass counts for though no view sees it.
     pub floor: f32,
-    /// Estimates Σ αT² without views.
+    /// Estimates Σ αT² without views; lengths in those of the scene.
     pub importance: Importance,
 }
 
@@ -54,9 +54,9 @@ pub struct Leaves<'a> {
     visibility: Option<Visibility<'a>>,
     /// Unit of the scene's lengths.
     unit: f64,
-    /// Σ αT² that a unit of mass counts for though no view sees it.
+    /// Σ αT² that a unit of apparent mass counts for though no view sees it.
     floor: f32,
-    /// Estimates Σ αT² without views.
+    /// Estimates Σ αT² without views; lengths in units, from the order's origin.
     importance: Importance,
 }
 
@@ -70,35 +70,37 @@ impl<'a> Leaves<'a> {
         visibility: Option<Visibility<'a>>,
         frame: Option<&Frame>,
     ) -> Self {
+        let unit = frame.map_or_else(|| unit(scene, ordered, blur), |f| f.unit);
         let mut leaves = Self {
             scene,
             ordered,
             kept,
             blur,
             visibility,
-            unit: frame.map_or_else(|| unit(scene, ordered, blur), |f| f.unit),
+            unit,
             floor: frame.map_or(0.0, |f| f.floor),
-            importance: frame.map_or_else(Importance::default, |f| f.importance),
+            importance: frame.map_or_else(Importance::default, |f| {
+                f.importance.in_units(ordered.bounds.origin, unit)
+            }),
         };
         if frame.is_some() {
             return leaves;
         }
+        let rows = (0..leaves.len()).into_par_iter();
+        let measured = rows.map(|i| leaves.without_areas(i).into());
+        leaves.importance = Importance::of_scene(&measured.collect::<Vec<_>>());
         if visibility.is_some() {
             let (weight, mass) = leaves.sums();
             leaves.floor = floor(weight, mass);
-        } else {
-            let rows = (0..leaves.len()).into_par_iter();
-            let measured = rows.map(|i| leaves.without_areas(i).into());
-            leaves.importance = Importance::of_scene(&measured.collect::<Vec<_>>());
         }
         leaves
     }
 
-    /// Σ αT² over the views, and mass, of all rows.
+    /// Σ αT² over the views, and apparent mass, of all rows.
     pub fn sums(&self) -> (f64, f64) {
         let masses: Vec<f32> = (0..self.len())
             .into_par_iter()
-            .map(|i| self.without_areas(i).mass)
+            .map(|i| self.apparent_mass(&self.without_areas(i)))
             .collect();
         let mass: f64 = masses.iter().map(|&m| f64::from(m)).sum();
         let weight = |v| self.kept.iter().map(move |&i| self.weight(v, i));
@@ -108,9 +110,14 @@ impl<'a> Leaves<'a> {
         (total, mass)
     }
 
-    /// The weight of rows without views, as computed by [`Self::new`].
+    /// The weight of rows without views, as computed by [`Self::new`], with lengths in those of the scene.
     pub fn importance(&self) -> Importance {
         self.importance
+            .in_scene(self.ordered.bounds.origin, self.unit)
+    }
+
+    fn apparent_mass(&self, node: &Node) -> f32 {
+        self.importance.apparent(node.mean, node.mass)
     }
 
     /// Their Morton codes, ascending.
@@ -172,7 +179,9 @@ impl Rows for Leaves<'_> {
         let mut node = self.without_areas(i);
         node.areas = node.areas_of();
         let visibility = match self.visibility {
-            Some(visibility) => self.weight(visibility, self.kept[i]) + self.floor * node.mass,
+            Some(visibility) => {
+                self.weight(visibility, self.kept[i]) + self.floor * self.apparent_mass(&node)
+            }
             None => self.importance.of(&node),
         };
         node.visibility = visibility.min(MAX_VISIBILITY);
@@ -193,7 +202,7 @@ impl Rows for Leaves<'_> {
     }
 }
 
-/// Σ αT² that a unit of mass counts for though no view sees it.
+/// Σ αT² that a unit of apparent mass counts for though no view sees it.
 pub fn floor(weight: f64, mass: f64) -> f32 {
     UNSEEN
         * if weight > 0.0 && mass > 0.0 {

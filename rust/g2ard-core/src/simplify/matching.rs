@@ -7,7 +7,7 @@ use rayon::prelude::*;
 
 use super::GONE;
 use super::clusters::Pair;
-use super::cost::{Node, color_distance};
+use super::cost::{Node, Weights, color_distance};
 use crate::raster::simd::{Isa, Kernel, LANES, Lanes, Lanes16, dispatch};
 use crate::spatial::{RobustBounds, Tree, codes, order};
 use crate::{Control, Result};
@@ -74,7 +74,7 @@ struct PairCosts<'a> {
     nodes: &'a Nodes,
     first: usize,
     k: usize,
-    geometric: f32,
+    weights: Weights,
     lists: &'a mut [Candidate],
 }
 
@@ -103,7 +103,7 @@ impl Kernel for PairCosts<'_> {
             }
             let (a, b) = (Node::<F>::read(&values[0]), Node::<F>::read(&values[1]));
             let mut costs = Lanes16::default();
-            a.cost(&b, F::load(&color), F::splat(self.geometric))
+            a.cost(&b, F::load(&color), self.weights.splat())
                 .store(&mut costs);
             for (candidate, cost) in self.lists[start..start + pairs].iter_mut().zip(costs.0) {
                 if candidate.1 != GONE {
@@ -163,7 +163,7 @@ impl<F: Lanes> Node<F> {
 pub fn candidates(
     nodes: &Nodes,
     k: usize,
-    geometric: f32,
+    weights: Weights,
     control: &Control,
 ) -> Result<Vec<Candidate>> {
     let tree: Tree<f32> = Tree::over((0..nodes.len() as u32).collect(), |i| {
@@ -191,7 +191,7 @@ pub fn candidates(
                 nodes,
                 first,
                 k,
-                geometric,
+                weights,
                 lists,
             };
             dispatch(isa, costs);
@@ -274,6 +274,11 @@ mod tests {
     use super::*;
     use crate::random::Lcg;
 
+    const WEIGHTS: Weights = Weights {
+        geometric: 0.03,
+        edge: 3.0,
+    };
+
     #[test]
     fn sixteen_pairs_cost_what_each_does_alone_to_the_bit() {
         let mut random = Lcg(5);
@@ -307,7 +312,7 @@ mod tests {
                 nodes: &nodes,
                 first,
                 k,
-                geometric: 0.03,
+                weights: WEIGHTS,
                 lists: &mut lists,
             };
             dispatch(isa, costs);
@@ -319,7 +324,7 @@ mod tests {
                 let (i, j) = (first + at / k, j as usize);
                 let (i, j) = (i.min(j), i.max(j));
                 let color = color_distance(nodes.sh_of(i), nodes.sh_of(j));
-                let alone = nodes.geometry[i].cost(&nodes.geometry[j], color, 0.03);
+                let alone = nodes.geometry[i].cost(&nodes.geometry[j], color, WEIGHTS);
                 assert_eq!(cost.to_bits(), alone.to_bits(), "{isa:?}: {i} {j}");
             }
         }
@@ -345,7 +350,7 @@ mod tests {
             width: 3,
         };
         let k = 4;
-        let lists = candidates(&nodes, k, 0.03, &Control::default()).unwrap();
+        let lists = candidates(&nodes, k, WEIGHTS, &Control::default()).unwrap();
         for i in 0..20 {
             let mut own: Vec<u32> = lists[i * k..(i + 1) * k].iter().map(|c| c.1).collect();
             own.sort_unstable();

@@ -4,13 +4,19 @@
 //! node is named by the gap between two neighbouring rows at which it splits, so one number per gap says what
 //! merging everything below it costs. That number never falls towards the root: cutting at any threshold
 //! leaves whole subtrees, which are contiguous runs of rows.
+//!
+//! Views that come nearer than those that weigh rows see what costs nothing from afar, such as the letters of a sign.
+//! Long runs are therefore dearer than their merges, and none is longer than a limit.
 
 use super::clusters::Partition;
-use super::cost::{Node, color_distance};
+use super::cost::{Node, Weights, color_distance};
 use super::rows::Rows;
 
 /// Rows below which a subtree is not worth another task.
 const GRAIN: usize = 4096;
+
+/// Cost of a run beyond the limit, for each of its rows: above that of every other run, and finite for 2³² rows.
+const TOO_LONG: f32 = 1e28;
 
 /// A subtree merged into one node, its colour, and the sum of its merges' costs.
 struct Subtree {
@@ -22,19 +28,22 @@ struct Subtree {
 struct MortonTree<'a, R> {
     codes: &'a [u64],
     rows: &'a R,
-    geometric: f32,
+    weights: Weights,
+    longest: usize,
 }
 
-/// For every gap between neighbouring rows, the cost of merging all rows that its tree node spans.
+/// For every gap between neighbouring rows, the cost of merging all rows that its tree node spans: the sum of its
+/// merges' costs times the root of the number of rows. Runs of more than `longest` rows cost more than all others.
 ///
 /// `codes` ascend; `rows` are in the same order.
-pub fn merge_costs(codes: &[u64], rows: &impl Rows, geometric: f32) -> Vec<f32> {
+pub fn merge_costs(codes: &[u64], rows: &impl Rows, weights: Weights, longest: usize) -> Vec<f32> {
     let mut costs = vec![0.0; rows.len().saturating_sub(1)];
     if !costs.is_empty() {
         let tree = MortonTree {
             codes,
             rows,
-            geometric,
+            weights,
+            longest,
         };
         tree.merge(0, rows.len(), &mut costs);
     }
@@ -63,7 +72,12 @@ impl<R: Rows> MortonTree<'_, R> {
             (self.merge(from, split, left), self.merge(split, to, right))
         };
         let subtree = self.join(&a, &b);
-        gap[0] = subtree.cost;
+        let count = (to - from) as f32;
+        gap[0] = if to - from > self.longest {
+            TOO_LONG * count
+        } else {
+            (subtree.cost * count.sqrt()).min(TOO_LONG)
+        };
         subtree
     }
 
@@ -82,25 +96,25 @@ impl<R: Rows> MortonTree<'_, R> {
         #[cfg(target_arch = "x86_64")]
         if std::arch::is_x86_feature_detected!("avx2") {
             // SAFETY: the processor has AVX2.
-            return unsafe { join_avx2(a, b, self.geometric) };
+            return unsafe { join_avx2(a, b, self.weights) };
         }
-        join(a, b, self.geometric)
+        join(a, b, self.weights)
     }
 }
 
 /// The same code with wider registers; no fused operations, so the same bits.
 #[cfg(target_arch = "x86_64")]
 #[target_feature(enable = "avx2")]
-fn join_avx2(a: &Subtree, b: &Subtree, geometric: f32) -> Subtree {
-    join(a, b, geometric)
+fn join_avx2(a: &Subtree, b: &Subtree, weights: Weights) -> Subtree {
+    join(a, b, weights)
 }
 
 #[inline(always)]
-fn join(a: &Subtree, b: &Subtree, geometric: f32) -> Subtree {
+fn join(a: &Subtree, b: &Subtree, weights: Weights) -> Subtree {
     let share = a.node.share(&b.node);
     let node = a.node.merged(&b.node);
     let color = color_distance(&a.color, &b.color);
-    let cost = a.node.cost_as(&b.node, &node, color, geometric);
+    let cost = a.node.cost_as(&b.node, &node, color, weights);
     Subtree {
         node,
         color: [0, 1, 2].map(|k| a.color[k] + share * (b.color[k] - a.color[k])),
@@ -142,6 +156,15 @@ mod tests {
     use super::*;
     use crate::simplify::matching::Nodes;
 
+    const WEIGHTS: Weights = Weights {
+        geometric: 0.03,
+        edge: 3.0,
+    };
+
+    fn costs_of(codes: &[u64], rows: &Nodes) -> Vec<f32> {
+        merge_costs(codes, rows, WEIGHTS, usize::MAX)
+    }
+
     fn nodes(n: usize) -> Nodes {
         let geometry = (0..n)
             .map(|i| {
@@ -167,7 +190,7 @@ mod tests {
     #[test]
     fn any_cut_leaves_whole_subtrees_and_the_exact_count() {
         let codes: Vec<u64> = (0..64).map(|i| i * 3).collect();
-        let costs = merge_costs(&codes, &nodes(64), 0.03);
+        let costs = costs_of(&codes, &nodes(64));
         for count in 1..=64 {
             let p = cut(&costs, count);
             assert_eq!((p.count, p.of.len()), (count, 64));
@@ -175,14 +198,21 @@ mod tests {
         }
         // Groups of eight lie far apart: the cheapest eight clusters are those groups.
         let codes: Vec<u64> = (0..64).collect();
-        let p = cut(&merge_costs(&codes, &nodes(64), 0.03), 8);
+        let p = cut(&costs_of(&codes, &nodes(64)), 8);
         assert!((0..64).all(|i| p.of[i] == i as u32 / 8), "{:?}", p.of);
     }
 
     #[test]
     fn a_gap_costs_what_all_merges_below_it_do() {
         let (codes, rows) = ((0..16).collect::<Vec<u64>>(), nodes(16));
-        let costs = merge_costs(&codes, &rows, 0.03);
+        let costs = costs_of(&codes, &rows);
+        // The trailing zeros of a gap's number say how many rows it joins.
+        let rows_of = |gap: usize| (2u32 << (gap + 1).trailing_zeros()) as f32;
+        let costs: Vec<f32> = costs
+            .iter()
+            .enumerate()
+            .map(|(gap, cost)| cost / rows_of(gap).sqrt())
+            .collect();
         let (left, right) = (&costs[..7], &costs[8..]);
         let alike = |a: f32, b: f32| (a - b).abs() <= 1e-5 * b;
         let pair = costs[0];
@@ -200,7 +230,28 @@ mod tests {
 
     #[test]
     fn one_place_and_one_row() {
-        assert_eq!(cut(&merge_costs(&[5; 9], &nodes(9), 0.03), 4).count, 4);
-        assert_eq!(cut(&merge_costs(&[5], &nodes(1), 0.03), 1).count, 1);
+        assert_eq!(cut(&costs_of(&[5; 9], &nodes(9)), 4).count, 4);
+        assert_eq!(cut(&costs_of(&[5], &nodes(1)), 1).count, 1);
+    }
+
+    #[test]
+    fn no_run_is_longer_than_the_limit_while_shorter_ones_suffice() {
+        // Half of the rows no view sees: all of them would merge for nothing.
+        let mut rows = nodes(64);
+        for (i, node) in rows.geometry.iter_mut().enumerate() {
+            node.visibility *= if i < 32 { 0.0 } else { 1.0 };
+        }
+        let codes: Vec<u64> = (0..64).collect();
+        let longest_of = |count: usize, limit: usize| {
+            let p = cut(&merge_costs(&codes, &rows, WEIGHTS, limit), count);
+            assert_eq!(p.count, count);
+            p.of.chunk_by(|a, b| a == b).map(<[u32]>::len).max()
+        };
+        assert_eq!(longest_of(33, usize::MAX), Some(32));
+        assert_eq!(longest_of(33, 8), Some(8));
+        assert_eq!(longest_of(8, 8), Some(8));
+        // The count comes first.
+        assert!(longest_of(7, 8) > Some(8));
+        assert_eq!(longest_of(1, 8), Some(64));
     }
 }

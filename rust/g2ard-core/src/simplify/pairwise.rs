@@ -7,6 +7,7 @@
 use rayon::prelude::*;
 
 use super::clusters::{Pair, Partition};
+use super::cost::Weights;
 use super::importance::median;
 use super::leaves::{Leaves, Visibility};
 use super::matching::{Nodes, candidates, matched};
@@ -29,10 +30,15 @@ constants! {
         pub morton_premerge_ratio: f64 = 3.0,
         /// Number of merging steps, each on a shifted lattice; every step except the first halves the count.
         pub morton_premerge_steps: usize = 1,
+        /// Rows of the longest run along Morton order, in mean runs.
+        pub longest_run: f64 = 6.0,
         /// Nearest clusters that one may merge with.
         pub neighbors: usize = 6,
         /// Weight of the geometric error beside that of colour; without views [`Self::BLIND`] of it.
         pub geometric_weight: f64 = 0.03,
+        /// Weight of the error of gradients beside that of values, in pixels squared. Only with views: without, no
+        /// pixel is known.
+        pub edge_weight: f64 = 0.5,
         /// Standard deviation of the blur that renderers add, in pixels.
         pub dilation: f64 = 0.4,
         /// Without views: size of a pixel over the median largest scale.
@@ -73,6 +79,7 @@ impl Pairwise {
         Self {
             morton_premerge_ratio: 1.0,
             morton_premerge_steps: 2,
+            longest_run: 4.0,
             ..Self::default()
         }
     }
@@ -96,15 +103,16 @@ impl Pairwise {
         control.advance(dropped as u64);
         let leaves = Leaves::new(scene, ordered, partition.kept(), &blur, visibility, None);
         let mut runs = RunMerging {
-            geometric: self.geometric(visibility),
+            weights: self.weights(visibility),
+            longest_run: self.longest_run,
             width: 0,
             partition: &mut partition,
             rounds: Vec::new(),
             control,
         };
         let mut nodes = self.premerge(leaves, budget, &mut runs)?;
-        let (geometric, mut rounds) = (runs.geometric, runs.rounds);
-        self.merge_rounds(&mut nodes, geometric, schedule, control, |pairs, map| {
+        let (weights, mut rounds) = (runs.weights, runs.rounds);
+        self.merge_rounds(&mut nodes, weights, schedule, control, |pairs, map| {
             let of = partition.of.par_iter_mut().filter(|c| **c != GONE);
             of.for_each(|c| *c = map[*c as usize]);
             let before = map.len();
@@ -144,7 +152,7 @@ impl Pairwise {
     pub(super) fn merge_rounds(
         &self,
         nodes: &mut Nodes,
-        geometric_weight: f32,
+        weights: Weights,
         schedule: &[usize],
         control: &Control,
         mut on_pairs: impl FnMut(&[Pair], &[u32]),
@@ -152,7 +160,7 @@ impl Pairwise {
         for &target in schedule {
             // Costs are finite, so the cheapest candidate of all matches, and each turn merges at least one pair.
             while nodes.len() > target {
-                let lists = candidates(nodes, self.neighbors, geometric_weight, control)?;
+                let lists = candidates(nodes, self.neighbors, weights, control)?;
                 let pairs = matched(&lists, self.neighbors, nodes.len() - target);
                 drop(lists);
                 if pairs.is_empty() {
@@ -192,14 +200,24 @@ impl Pairwise {
         Ok(rows.settled())
     }
 
-    /// The weight of the geometric error, in the kernels' precision.
-    pub(super) fn geometric(&self, visibility: Option<Visibility>) -> f32 {
-        let share = if visibility.is_some() {
-            1.0
-        } else {
-            Self::BLIND
-        };
-        (self.geometric_weight * share) as f32
+    /// The weights of a cost's parts, in the kernels' precision.
+    pub(super) fn weights(&self, visibility: Option<Visibility>) -> Weights {
+        if visibility.is_none() {
+            return Weights {
+                geometric: (self.geometric_weight * Self::BLIND) as f32,
+                edge: 0.0,
+            };
+        }
+        // A node knows the size of its pixel by its blur, which is none in antialiased scenes.
+        let blur = self.dilation * self.dilation;
+        Weights {
+            geometric: self.geometric_weight as f32,
+            edge: if blur > 0.0 {
+                (self.edge_weight / blur) as f32
+            } else {
+                0.0
+            },
+        }
     }
 
     pub(super) fn check(
@@ -224,6 +242,7 @@ impl Pairwise {
         refuse!(self.neighbors == 0 => "neighbors", "at least 1", 0);
         for (name, value) in [
             ("morton_premerge_ratio", self.morton_premerge_ratio),
+            ("longest_run", self.longest_run),
             ("max_growth", self.max_growth),
         ] {
             refuse!(value.is_nan() || value < 1.0 => name, "at least 1", value);
@@ -291,7 +310,8 @@ impl Pairwise {
 
 /// Merging along Morton order, and its effect on the partition.
 struct RunMerging<'a> {
-    geometric: f32,
+    weights: Weights,
+    longest_run: f64,
     /// Values of SH that the nodes keep.
     width: usize,
     partition: &'a mut Partition,
@@ -310,7 +330,8 @@ impl RunMerging<'_> {
         step: usize,
     ) -> Result<(Shuffled, Vec<u64>)> {
         self.control.check()?;
-        let costs = merge_costs(codes, rows, self.geometric);
+        let longest = longest(self.longest_run, rows.len() as f64 / target as f64);
+        let costs = merge_costs(codes, rows, self.weights, longest);
         let third = ((rows.len() - target.min(rows.len())) / 3) as u64;
         self.control.advance(third);
         self.control.check()?;
@@ -329,6 +350,11 @@ impl RunMerging<'_> {
             .advance((rows.len() - runs.count) as u64 - 2 * third);
         Ok((Shuffled { nodes, at }, codes))
     }
+}
+
+/// The most rows of a run, at least a pair.
+pub(super) fn longest(longest_run: f64, mean_run: f64) -> usize {
+    (longest_run * mean_run).max(2.0) as usize
 }
 
 /// Merge the pairs and put the remaining nodes in Morton order. Return the new index of every node.
@@ -459,7 +485,13 @@ mod tests {
         let mut nodes = Leaves::new(&scene, &ordered, rows, &blur, visibility, None).nodes();
         while nodes.len() > KEPT {
             assert!(nodes.geometry.iter().all(finite), "{what}");
-            let lists = candidates(&nodes, policy.neighbors, 0.03, &control).unwrap();
+            let lists = candidates(
+                &nodes,
+                policy.neighbors,
+                policy.weights(visibility),
+                &control,
+            )
+            .unwrap();
             let partners = lists.iter().filter(|c| c.1 != GONE);
             assert!(partners.clone().count() >= nodes.len(), "{what}");
             assert!(partners.clone().all(|c| c.0.is_finite() && c.0 >= 0.0));
@@ -495,7 +527,7 @@ mod tests {
             tile.frame = frame;
         }
         let runs = 20;
-        let costs = tile.run_costs().unwrap();
+        let costs = tile.run_costs(2.0).unwrap();
         let plan = tile.plan(runs, &[KEPT], &costs, &control).unwrap();
         assert_eq!(plan.merges.len(), runs - KEPT, "{what}");
         assert!(plan.merges.iter().all(|p| p.cost.is_finite()), "{what}");
@@ -599,7 +631,9 @@ mod tests {
             width: 3,
         };
         let control = Control::default();
-        let ended = Pairwise::default().merge_rounds(&mut nodes, 0.03, &[3], &control, |_, _| ());
+        let policy = Pairwise::default();
+        let ended =
+            policy.merge_rounds(&mut nodes, policy.weights(None), &[3], &control, |_, _| ());
         assert!(matches!(ended, Err(Error::Stuck(_))), "{ended:?}");
     }
 
@@ -624,7 +658,7 @@ mod tests {
             };
             let (weight, mass) = tile.sums().unwrap();
             tile.frame = tile.frame.with_views(0.01, weight, mass);
-            let costs = tile.run_costs().unwrap();
+            let costs = tile.run_costs(2.0).unwrap();
             (tile.plan(30, &[5], &costs, &control).unwrap(), costs)
         };
         let usual = costs(frame.unit);

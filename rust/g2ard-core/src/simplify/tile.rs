@@ -7,9 +7,10 @@
 //! many of those a tile does, [`Tile::assemble`] makes its Gaussians.
 
 use super::clusters::{Pair, Partition};
+use super::cost::Weights;
 use super::leaves::{Frame, Leaves, Visibility, floor, unit};
 use super::morton_tree::{cut, merge_costs};
-use super::pairwise::PairwiseRound;
+use super::pairwise::{PairwiseRound, longest};
 use super::rows::Rows;
 use super::{GONE, Outcome, Pairwise};
 use crate::scene::{Ordered, SceneRef};
@@ -67,11 +68,18 @@ impl Tile<'_> {
         Ok(self.leaves(&blur)?.sums())
     }
 
-    /// The cost of closing each gap between neighbours in Morton order, from the first kept row on.
-    pub fn run_costs(&self) -> Result<Vec<f32>> {
+    /// The cost of closing each gap between neighbours in Morton order, from the first kept row on; `mean_run` is the
+    /// number of rows of a run, in the mean over all tiles.
+    pub fn run_costs(&self, mean_run: f64) -> Result<Vec<f32>> {
         let blur = self.blurs();
         let leaves = self.leaves(&blur)?;
-        Ok(merge_costs(&leaves.codes(), &leaves, self.geometric()))
+        let longest = longest(self.policy.longest_run, mean_run);
+        Ok(merge_costs(
+            &leaves.codes(),
+            &leaves,
+            self.weights(),
+            longest,
+        ))
     }
 
     /// Merge down to `runs` runs along Morton order, then pairs of neighbours in rounds down to each count of
@@ -107,9 +115,9 @@ impl Tile<'_> {
         // The run that each node began with; a merged node keeps that of the node it was merged into.
         let mut names: Vec<u32> = (0..runs as u32).collect();
         let mut merges = Vec::new();
-        let geometric = self.geometric();
+        let weights = self.weights();
         self.policy
-            .merge_rounds(&mut nodes, geometric, schedule, control, |pairs, map| {
+            .merge_rounds(&mut nodes, weights, schedule, control, |pairs, map| {
                 let mut next = vec![0; map.len() - pairs.len()];
                 for &Pair { a, b, cost } in pairs {
                     let (a, b) = (a as usize, b as usize);
@@ -168,7 +176,7 @@ impl Tile<'_> {
         ))
     }
 
-    fn geometric(&self) -> f32 {
-        self.policy.geometric(self.visibility)
+    fn weights(&self) -> Weights {
+        self.policy.weights(self.visibility)
     }
 }
