@@ -123,6 +123,9 @@ _View = tuple[list[list[float]], list[float], tuple[int, int], float]
 
 def instruction_sets() -> list[str]: ...
 
+class RowBounds:
+    def __init__(self, arrays: _Arrays) -> None: ...
+
 class Rasterizer:
     def __init__(self, isa: str | None = None) -> None: ...
     def forward(
@@ -132,9 +135,15 @@ class Rasterizer:
         options: RasterSettings,
         background: list[float],
         depths: int = 1,
+        bounds: RowBounds | None = None,
     ) -> tuple[_F32, _F32, _F32 | None, _F32 | None]: ...
     def image(
-        self, scene: _Arrays, view: _View, options: RasterSettings, background: list[float]
+        self,
+        scene: _Arrays,
+        view: _View,
+        options: RasterSettings,
+        background: list[float],
+        bounds: RowBounds | None = None,
     ) -> _F32: ...
     def draw(
         self,
@@ -143,6 +152,7 @@ class Rasterizer:
         options: RasterSettings,
         corners: _Corners,
         planes: tuple[_F32, _F32, _F32 | None, _F32 | None],
+        bounds: RowBounds | None = None,
     ) -> None: ...
     def backward(
         self, arrays: _Arrays, image: _F32, alpha: _F32 | None = None, depth: _F32 | None = None

@@ -48,7 +48,7 @@ class Boxes(Study):
         place = Workspace(work, self, scene)
         for boxes in self.boxes:
             for name in self.methods:
-                names = {"boxes": boxes, "skipped": name}
+                names = {"boxes": boxes, "method": name}
                 yield Cell(names, partial(self._measured, place, boxes, _LEAST_LIGHT[name]))
 
     def _measured(self, place: Workspace, boxes: int, least: float) -> list[Row]:
@@ -76,7 +76,6 @@ class Boxes(Study):
             {
                 "count": len(splats),
                 "rows_per_gaussian": sum(map(len, rows)) / len(splats),
-                "leaves": tree.leaves,
                 "drawn_share": totals["drawn"] / (count * tree.leaves),
                 "whole_ms": totals["whole_ms"] / count,
                 "boxes_ms": totals["boxes_ms"] / count,

@@ -25,7 +25,7 @@ from g2ard.stages.recover.config import Rates
 from g2ard.stages.recover.engine import Photometric
 from g2ard.system import devices
 
-__all__ = ["GPU", "Raster", "built_in_view", "drawn", "timed_step"]
+__all__ = ["GPU", "Raster", "built_in_view", "copied_behind", "drawn", "timed_step"]
 
 GPU = "gpu: "
 """Prefix of an adapter's name among instruction sets."""
@@ -40,6 +40,7 @@ class Raster(Study):
         counts: Gaussians drawn from the scene.
         image: width and height of the view, for scenes without views.
         threads: thread counts; 0 means the current one.
+        copies: how often the drawn Gaussians stand in the scene; all but one are behind the view.
         repeats: timed steps; the fastest is recorded.
     """
 
@@ -48,6 +49,7 @@ class Raster(Study):
     counts: tuple[int, ...] = key((20_000, 100_000, 300_000), least=1, axis=True)
     image: tuple[int, int] = key((640, 480), least=1)
     threads: tuple[int, ...] = key((0,), least=0, axis=True)
+    copies: tuple[int, ...] = key((1,), least=1, axis=True)
     repeats: int = key(15, least=1)
 
     def cells(self, scene: SceneSpec, work: Path) -> Iterator[Cell]:
@@ -58,16 +60,18 @@ class Raster(Study):
             for isa in isas:
                 for threads in self.threads:
                     many = threads or _core.num_threads()
-                    names = {"count": count, "isa": isa, "threads": many}
-                    yield Cell(names, partial(self._measured, place, count, isa, many))
+                    for copies in self.copies:
+                        names = {"count": count, "isa": isa, "threads": many, "copies": copies}
+                        yield Cell(names, partial(self._measured, place, count, isa, many, copies))
 
-    def _measured(self, place: Workspace, count: int, isa: str, threads: int) -> list[Row]:
+    def _measured(self, place: Workspace, count: int, isa: str, threads: int, copies: int) -> list[Row]:
         before = _core.num_threads()
         try:
             _core.set_num_threads(threads)
             splats = place.splats
             view = place.train_cameras if place.scene.train else built_in_view(splats, *self.image)
-            return [timed_step(drawn(splats, count, seed=self.seeds[0]), view, isa, self.repeats)]
+            shown = drawn(splats, count, seed=self.seeds[0])
+            return [timed_step(copied_behind(shown, view, copies), view, isa, self.repeats)]
         finally:
             _core.set_num_threads(before)
 
@@ -85,6 +89,19 @@ def drawn(splats: Splats, count: int, *, seed: int = 0) -> Splats:
     rows = np.sort(np.random.default_rng(seed).permutation(len(splats))[:count])
     taken = splats.take(rows).with_sh_degree(3)
     return replace(taken, scales=taken.scales * np.float32(np.sqrt(len(splats) / count)))
+
+
+def copied_behind(splats: Splats, cameras: Cameras, copies: int) -> Splats:
+    """Return the scene and copies of it behind the first view, in a row that the view does not see."""
+    size = float(np.ptp(splats.means, axis=0).max())
+    here = cameras.positions[0] - splats.offset
+    back = -cameras.viewmats[0, 2, :3]
+    away = float(np.linalg.norm(splats.means - here, axis=1).max())
+    shifts = [back * (away + (1 + k) * 2 * size) for k in range(copies - 1)]
+    rows = np.tile(np.arange(len(splats)), copies)
+    moves = np.concatenate([np.tile(shift, (len(splats), 1)) for shift in [np.zeros(3), *shifts]])
+    taken = splats.take(rows)
+    return replace(taken, means=(taken.means + moves).astype(np.float32))
 
 
 def built_in_view(splats: Splats, width: int, height: int) -> Cameras:
@@ -113,6 +130,10 @@ def timed_step(splats: Splats, cameras: Cameras, isa: str | None, repeats: int) 
     target = np.ascontiguousarray(rendered[::-1])
     trainer = _core.Trainer(arrays, Photometric(settings, (0.0, 0.0, 0.0), 0.2), splats.scales.max(1), isa)
     still = Rates(*[0.0] * 6)  # rates of 0 keep the scene
+    rasterizer = _core.Rasterizer(isa)
+    images = timeit.repeat(
+        lambda: rasterizer.image(arrays, view, settings, [0.0, 0.0, 0.0]), number=1, repeat=repeats
+    )
     steps = timeit.repeat(lambda: trainer.step(view, target, still), number=1, repeat=repeats)
     if notes := devices.notes():
         raise InputError(notes[0])
@@ -120,5 +141,6 @@ def timed_step(splats: Splats, cameras: Cameras, isa: str | None, repeats: int) 
         "width": width,
         "height": height,
         "total_ms": 1e3 * min(steps),
+        "image_ms": 1e3 * min(images),
         "contributing": int(_core.accumulate(arrays, [view], settings)["hits"].sum()),
     }

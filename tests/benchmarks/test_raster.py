@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.kinds.raster import built_in_view, drawn
+from benchmarks.kinds.raster import built_in_view, copied_behind, drawn
 from benchmarks.study import SceneSpec
 from g2ard import _core
 from g2ard.io import write_splats
@@ -35,6 +35,7 @@ def test_figures_hang_together(tmp_path: Path) -> None:
     for row in rows:
         assert (row["count"], row["width"], row["height"]) == (1000, 96, 64)
         assert row["total_ms"] > 0
+        assert row["image_ms"] > 0
         assert row["contributing"] > 1000
     assert len({row["contributing"] for row in rows}) == 1
 
@@ -55,6 +56,13 @@ def test_a_gpu_is_measured_beside_the_cpu(tmp_path: Path) -> None:
     if adapters[0].timestamps:
         assert all(rows[1][f"{name}_ms"] > 0 for name in ("project", "sort", "draw", "backward", "update"))
     assert "draw_ms" not in rows[0]
+
+
+def test_copies_are_out_of_view() -> None:
+    shown, view = drawn(cloud(), 500), built_in_view(cloud(), 96, 64)
+    many = copied_behind(shown, view, 4)
+    assert len(many) == 2000
+    np.testing.assert_array_equal(render(many, view[0]).image, render(shown, view[0]).image)
 
 
 def test_the_built_in_view_sees_the_scene() -> None:

@@ -207,6 +207,43 @@ def test_visibility_equals_the_oracles() -> None:
     assert np.allclose(got.pixel_size[inside], camera_z[inside] / cameras.Ks[0, 1, 1], rtol=1e-5)
 
 
+@pytest.mark.parametrize("variant", ["default", "inria-antialiased"])
+def test_rows_out_of_view_are_skipped_without_a_trace(variant: str) -> None:
+    """Bounds of rows change no bit of an image, whether the scene is ordered in space or not."""
+    p = scene(6, 4000, 1, size=0.03, spread=2.0)
+    p["log_scales"][::500] = 0.5
+    order = np.lexsort(np.floor(p["means"]).T)
+    settings = VARIANTS[variant]
+    for rows in (order, slice(None)):
+        arrays = arrays_of(splats_of({name: values[rows] for name, values in p.items()}))
+        bounds, rasterizer = _core.RowBounds(arrays), _core.Rasterizer()
+        for seed in range(8):
+            view = view_of(camera(60, 45, distance=0.7 * seed + 0.1, seed=seed), 0, settings)
+            forward = [
+                rasterizer.forward(arrays, view, settings, [0.1, 0.2, 0.3], 2, given)
+                for given in (None, bounds)
+            ]
+            for whole, skipped in zip(*forward, strict=True):
+                assert whole is not None
+                np.testing.assert_array_equal(whole, skipped)
+            np.testing.assert_array_equal(
+                rasterizer.image(arrays, view, settings, [0.1, 0.2, 0.3], bounds), forward[0][0]
+            )
+            pull = np.random.default_rng(seed).normal(size=(45, 60, 3)).astype(np.float32)
+            after_bounds = rasterizer.backward(arrays, pull)
+            rasterizer.forward(arrays, view, settings, [0.1, 0.2, 0.3])
+            for a, b in zip(after_bounds, rasterizer.backward(arrays, pull), strict=True):
+                np.testing.assert_array_equal(a, b)
+
+
+def test_bounds_of_other_rows_are_an_error() -> None:
+    arrays, others = (arrays_of(splats_of(scene(0, n, 0))) for n in (600, 200))
+    settings = settings_for(arrays[0])
+    view = view_of(camera(8, 8), 0, settings)
+    with pytest.raises(InputError, match="bounds: expected 3 bounds"):
+        _core.Rasterizer().forward(arrays, view, settings, [0.0] * 3, 1, _core.RowBounds(others))
+
+
 def test_bad_input_is_named() -> None:
     p = scene(0, 4, 1)
     cameras = camera(8, 8)

@@ -66,6 +66,7 @@ fn race_of_trainers(gpu: &Arc<Gpu>, rows: usize, size: [usize; 2]) -> Result<(Du
         sh0: &draw(3, -1.0, 1.0),
         sh_n: &[],
         sh_coeffs: 1,
+        bounds: None,
     };
     let start = Store::new(&params, None)?.export();
     let mut there = train::Trainer::new(gpu.clone(), &start, params.sh_coeffs)?;

@@ -35,7 +35,8 @@ mod _core {
     use crate::quantize::{codebook, palette};
     #[pymodule_export]
     use crate::raster::{
-        PyRasterizer, accumulate, accumulate_each, instruction_sets, light_on, reaching,
+        PyRasterizer, PyRowBounds, accumulate, accumulate_each, instruction_sets, light_on,
+        reaching,
     };
     #[pymodule_export]
     use crate::register::{flow, local_zncc, normal_equations, shot};

@@ -3,7 +3,7 @@
 use g2ard_core::Result;
 use g2ard_core::raster::simd::Isa;
 use g2ard_core::raster::{
-    Accumulated, Camera, Canvas, Gradients, Image, ImageGradients, Params, PoseGradient,
+    Accumulated, Bounds, Camera, Canvas, Gradients, Image, ImageGradients, Params, PoseGradient,
     Rasterizer, Settings, light_on as core_light_on, reaching as core_reaching,
 };
 use numpy::{
@@ -47,9 +47,33 @@ impl Arrays<'_> {
             sh0: flat("sh0", &self.4)?,
             sh_n: flat("shN", &self.5)?,
             sh_coeffs: rest + 1,
+            bounds: None,
         };
         params.validate().map_err(to_py)?;
         Ok(params)
+    }
+}
+
+/// Bounds of a scene's rows, which must not change, so that views skip those that they cannot see.
+#[pyclass(name = "RowBounds", module = "g2ard._core", frozen)]
+pub struct PyRowBounds(Vec<Bounds>);
+
+#[pymethods]
+impl PyRowBounds {
+    #[new]
+    fn new(py: Python<'_>, arrays: Arrays<'_>) -> PyResult<Self> {
+        let params = arrays.params()?;
+        work::quick(py, || Ok(Self(params.find_bounds())))
+    }
+}
+
+impl<'a> Arrays<'a> {
+    /// The parameters with their bounds, if they are known.
+    fn bounded<'b>(&'b self, bounds: &'b Option<PyRef<'_, PyRowBounds>>) -> PyResult<Params<'b>> {
+        Ok(Params {
+            bounds: bounds.as_ref().map(|bounds| &bounds.0[..]),
+            ..self.params()?
+        })
     }
 }
 
@@ -161,6 +185,7 @@ impl PyRasterizer {
 
     /// Return the image (H, W, 3) alone, drawn by the device in use. A device keeps the scene while the same tuple of
     /// arrays is passed, whose values must not change.
+    #[pyo3(signature = (scene, view, options, background, bounds = None))]
     fn image<'py>(
         &self,
         py: Python<'py>,
@@ -168,9 +193,10 @@ impl PyRasterizer {
         view: View,
         options: RasterOptions,
         background: [f32; 3],
+        bounds: Option<PyRef<'py, PyRowBounds>>,
     ) -> PyResult<Array<'py, numpy::Ix3>> {
         let arrays: Arrays<'_> = scene.extract()?;
-        let params = arrays.params()?;
+        let params = arrays.bounded(&bounds)?;
         let (camera, settings) = (view.camera(), options.settings()?);
         camera.validate().map_err(to_py)?;
         let mut rendering = work::locked(py, &self.0);
@@ -197,8 +223,8 @@ impl PyRasterizer {
 
     /// Return image (H, W, 3), alpha (H, W), depth (H, W) and median depth (H, W); the first `depths` of the two
     /// depths, None for the others.
-    #[pyo3(signature = (arrays, view, options, background, depths = 1))]
-    #[allow(clippy::type_complexity)]
+    #[pyo3(signature = (arrays, view, options, background, depths = 1, bounds = None))]
+    #[allow(clippy::type_complexity, clippy::too_many_arguments)]
     fn forward<'py>(
         &self,
         py: Python<'py>,
@@ -207,13 +233,14 @@ impl PyRasterizer {
         options: RasterOptions,
         background: [f32; 3],
         depths: usize,
+        bounds: Option<PyRef<'py, PyRowBounds>>,
     ) -> PyResult<(
         Array<'py, numpy::Ix3>,
         Array<'py, numpy::Ix2>,
         Option<Array<'py, numpy::Ix2>>,
         Option<Array<'py, numpy::Ix2>>,
     )> {
-        let params = arrays.params()?;
+        let params = arrays.bounded(&bounds)?;
         let (camera, settings) = (view.camera(), options.settings()?);
         camera.validate().map_err(to_py)?;
         let (height, width) = (camera.height, camera.width);
@@ -244,6 +271,8 @@ impl PyRasterizer {
     }
 
     /// Draw a box of the scene behind what the planes (color, light, depth, median) show, in place.
+    #[pyo3(signature = (arrays, view, options, corners, planes, bounds = None))]
+    #[expect(clippy::too_many_arguments, reason = "Python's signature")]
     fn draw(
         &self,
         py: Python<'_>,
@@ -252,8 +281,9 @@ impl PyRasterizer {
         options: RasterOptions,
         corners: Corners,
         mut planes: Planes<'_>,
+        bounds: Option<PyRef<'_, PyRowBounds>>,
     ) -> PyResult<()> {
-        let params = arrays.params()?;
+        let params = arrays.bounded(&bounds)?;
         let (camera, settings, region) = (view.camera(), options.settings()?, corners.into());
         let mut canvas = planes.canvas()?;
         let mut rendering = work::locked(py, &self.0);

@@ -1,7 +1,8 @@
 //! Access to the Gaussians' stored values, sixteen rows at a time.
 
+use super::bounds::{Bounds, GROUPS};
 use super::simd::{LANES, Lanes, Lanes16};
-use crate::Result;
+use crate::{Error, Result};
 
 /// N Gaussians in the torch layout: row-major borrowed slices, each in its stored (not activated) space.
 #[derive(Debug, Clone, Copy)]
@@ -20,6 +21,8 @@ pub struct Params<'a> {
     pub sh_n: &'a [f32],
     /// K: 1, 4, 9 or 16.
     pub sh_coeffs: usize,
+    /// What [`Params::find_bounds`] returned for these rows; with it, rows that a view cannot see cost nothing.
+    pub bounds: Option<&'a [Bounds]>,
 }
 
 impl Params<'_> {
@@ -46,6 +49,13 @@ impl Params<'_> {
             refuse!(slice.len() != n * width =>
                 name, format!("{n} rows of {width}"), format!("{} values", slice.len()));
         }
+        let bounds = n.div_ceil(LANES).div_ceil(GROUPS);
+        Error::unless_equal(
+            "bounds",
+            self.bounds.map_or(bounds, <[_]>::len),
+            bounds,
+            "bounds",
+        )?;
         Ok(())
     }
 }
@@ -62,6 +72,10 @@ pub(crate) trait Source: Copy + Sync {
     const COLOURED: bool = true;
 
     fn len(&self) -> usize;
+    /// Bounds of every [`GROUPS`] groups, if they are known.
+    fn bounds(&self) -> Option<&[Bounds]> {
+        None
+    }
     fn sh_coeffs(&self) -> usize;
     fn mean<F: Lanes>(&self, group: usize, axis: usize) -> F;
     fn quat<F: Lanes>(&self, group: usize, part: usize) -> F;
@@ -94,6 +108,9 @@ impl Source for Params<'_> {
     #[inline(always)]
     fn len(&self) -> usize {
         self.logit_opacities.len()
+    }
+    fn bounds(&self) -> Option<&[Bounds]> {
+        self.bounds
     }
     #[inline(always)]
     fn sh_coeffs(&self) -> usize {

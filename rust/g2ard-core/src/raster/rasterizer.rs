@@ -16,8 +16,10 @@ use super::BATCH;
 use super::backward::SUMS;
 use super::bins::Bins;
 use super::blocks::BlockMasks;
+use super::bounds;
 use super::depth_sort::{self, Key};
 use super::disjoint::DisjointSlice;
+use super::frustum::Frustum;
 use super::gradients::{Gather, Gradients};
 use super::grid::TileGrid;
 use super::memory;
@@ -34,6 +36,8 @@ pub use views::{Image, ImageGradients};
 
 /// Groups of sixteen rows projected as one piece of work; one under Miri, which runs few rows.
 const CHUNK: usize = if cfg!(miri) { 1 } else { 64 };
+/// Bounds of a chunk.
+const PARTS: usize = CHUNK.div_ceil(bounds::GROUPS);
 
 /// One chunk of rows after the backward pass: its visible splats and the location of their sums.
 pub(crate) struct ChunkSums<'a> {
@@ -44,6 +48,9 @@ pub(crate) struct ChunkSums<'a> {
     pub slots: &'a [[f32; SUMS]],
     pub written: &'a [u8],
 }
+
+/// A chunk's number, and which of its parts the view may see.
+type SeenChunk = (u32, [bool; PARTS]);
 
 struct ForwardState {
     camera: Camera,
@@ -62,7 +69,9 @@ pub struct Rasterizer {
     splats: Vec<Splat>,
     tile_lists: Vec<TileList>,
     intersectors: Vec<TileIntersector>,
-    /// (first splat, number visible) of each chunk of rows.
+    /// The chunks of rows that the view may see, ascending, and which of their parts.
+    seen: Vec<SeenChunk>,
+    /// (first splat, number visible) of each of these chunks.
     chunks: Vec<(usize, usize)>,
     /// Visible splats by depth: the first [`Self::collect_keys`] of them.
     order: Vec<Key>,
@@ -174,7 +183,7 @@ impl Rasterizer {
         Ok(())
     }
 
-    /// Fill the slots, then call `finish(chunk, slots of the chunk's splats)` for every chunk of rows in parallel;
+    /// Fill the slots, then call `finish(chunk, slots of the chunk's splats)` for every seen chunk of rows in parallel;
     /// return the results in order.
     pub(crate) fn backward_by_chunk<T: Send>(
         &mut self,
@@ -186,7 +195,8 @@ impl Rasterizer {
             return Vec::new();
         };
         let groups = state.rows.div_ceil(LANES);
-        let finish = |(chunk, (splats, slots)): (usize, (&[Splat], Range<usize>))| {
+        let finish = |(at, (splats, slots)): (usize, (&[Splat], Range<usize>))| {
+            let chunk = self.seen[at].0 as usize;
             finish(&ChunkSums {
                 view: &state.view,
                 first_group: chunk * CHUNK,
@@ -199,7 +209,7 @@ impl Rasterizer {
         self.visible().enumerate().map(finish).collect()
     }
 
-    /// The visible splats of every chunk of rows, and their slots.
+    /// The visible splats of every seen chunk of rows, and their slots.
     fn visible(&self) -> impl IndexedParallelIterator<Item = (&[Splat], Range<usize>)> {
         let chunks = self.chunks.par_iter().enumerate();
         chunks.with_max_len(1).map(|(chunk, &(first, count))| {
@@ -219,6 +229,7 @@ impl Rasterizer {
     ) -> Result<()> {
         let (view, rows) = (View::new(camera, settings), source.len());
         self.state = None;
+        self.find_seen(&source, camera);
         self.project(&view, source, grid);
         let visible = self.collect_keys();
         depth_sort::sort(&mut self.order, &mut self.spare, visible);
@@ -247,32 +258,61 @@ impl Rasterizer {
         Ok(())
     }
 
+    /// Lists the chunks of rows that a view may see.
+    fn find_seen<S: Source>(&mut self, source: &S, camera: &Camera) {
+        let chunks = source.len().div_ceil(CHUNK * LANES);
+        self.seen.clear();
+        let Some(bounds) = source.bounds() else {
+            (self.seen).extend((0..chunks as u32).map(|chunk| (chunk, [true; PARTS])));
+            return;
+        };
+        let frustum = Frustum::of(camera);
+        let parts = bounds.par_chunks(PARTS).map(|parts| {
+            let mut seen = [false; PARTS];
+            for (seen, part) in seen.iter_mut().zip(parts) {
+                *seen = part.tile_rows(&frustum).is_some();
+            }
+            seen
+        });
+        let seen = (0..).zip(parts.collect::<Vec<_>>());
+        (self.seen).extend(seen.filter(|(_, seen)| seen.contains(&true)));
+    }
+
     fn project<S: Source>(&mut self, view: &View, source: S, grid: TileGrid) {
         let groups = source.len().div_ceil(LANES);
         let isa = self.isa;
-        let splats = memory::first(&mut self.splats, groups * LANES);
-        let tile_lists = memory::first(&mut self.tile_lists, groups * LANES);
+        let rows = self.seen.len() * CHUNK * LANES;
+        let splats = memory::first(&mut self.splats, rows);
+        let tile_lists = memory::first(&mut self.tile_lists, rows);
         self.intersectors
-            .resize_with(groups.div_ceil(CHUNK), TileIntersector::default);
+            .resize_with(self.seen.len(), TileIntersector::default);
         let parts = splats
             .par_chunks_mut(CHUNK * LANES)
             .zip(tile_lists.par_chunks_mut(CHUNK * LANES))
-            .zip(&mut self.intersectors);
-        let project =
-            |(chunk, ((out, tile_lists), intersector)): (usize, ((&mut _, &mut _), &mut _))| {
-                let first = chunk * CHUNK;
-                let project = Project {
-                    view,
-                    source,
-                    first,
-                    last: groups.min(first + CHUNK),
-                    grid,
-                    out,
-                    tile_lists,
-                    intersector,
-                };
-                (first * LANES, dispatch(isa, project))
+            .zip(&mut self.intersectors)
+            .zip(&self.seen);
+        type Part<'a> = (
+            (
+                (&'a mut [Splat], &'a mut [TileList]),
+                &'a mut TileIntersector,
+            ),
+            &'a SeenChunk,
+        );
+        let project = |(at, (((out, tile_lists), intersector), (chunk, seen))): (usize, Part)| {
+            let first = *chunk as usize * CHUNK;
+            let project = Project {
+                seen,
+                view,
+                source,
+                first,
+                last: groups.min(first + CHUNK),
+                grid,
+                out,
+                tile_lists,
+                intersector,
             };
+            (at * CHUNK * LANES, dispatch(isa, project))
+        };
         parts
             .enumerate()
             .with_max_len(1)

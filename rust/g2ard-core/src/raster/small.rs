@@ -44,6 +44,7 @@ impl Small {
             sh0: &self.sh0,
             sh_n: &self.sh_n,
             sh_coeffs: SH_COEFFS,
+            bounds: None,
         }
     }
 }

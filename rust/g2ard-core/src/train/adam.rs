@@ -3,6 +3,7 @@
 use super::Rates;
 use super::anchors::{Anchors, Regularizers};
 use super::store::{Block, Blocks, LOG_SCALE, LOGIT, QUAT, SH};
+use crate::raster::bounds::GROUPS;
 use crate::raster::gradients::collect;
 use crate::raster::project::{RowGradients, unproject};
 use crate::raster::rasterizer::ChunkSums;
@@ -73,34 +74,43 @@ impl Kernel for Update<'_> {
     fn run<F: Lanes>(self) -> (usize, usize) {
         let sums = self.sums;
         let (mut next, mut updated, mut skipped) = (0, 0, 0);
-        for group in sums.first_group..sums.last_group {
-            // A bit for each row of the group; lanes of others hold meaningless values.
-            let (mut active, screen) =
-                collect::<F>(sums.splats, &mut next, group, sums.slots, sums.written);
-            let free = self.free.map_or(u16::MAX, |free| free[group]);
-            active &= free;
-            if free == 0 || (active == 0 && self.regularize.is_none()) {
-                continue;
-            }
-            // SAFETY: a group belongs to one chunk, a chunk to one thread, and the block of the group before was dropped.
-            let mut block = unsafe { self.blocks.block(group) };
-            let mut g = unproject(sums.view, &block.parameters(), group, &screen);
-            if let Some((weights, anchors)) = self.regularize {
-                let seen = F::Mask::from_bits(active);
-                zero_unseen(&mut g, seen);
-                let rows = (self.blocks.rows - group * LANES).min(LANES);
-                let real = ((1u32 << rows) - 1) as u16 & free;
-                active |= anchors.add_gradients(weights, &block.parameters(), group, &mut g) & real;
-                if active == 0 {
+        for first in (sums.first_group..sums.last_group).step_by(GROUPS) {
+            let last = sums.last_group.min(first + GROUPS);
+            let before = updated;
+            for group in first..last {
+                // A bit for each row of the group; lanes of others hold meaningless values.
+                let (mut active, screen) =
+                    collect::<F>(sums.splats, &mut next, group, sums.slots, sums.written);
+                let free = self.free.map_or(u16::MAX, |free| free[group]);
+                active &= free;
+                if free == 0 || (active == 0 && self.regularize.is_none()) {
                     continue;
                 }
+                // SAFETY: a group belongs to one chunk, a chunk to one thread, and the block of the group before was dropped.
+                let mut block = unsafe { self.blocks.block(group) };
+                let mut g = unproject(sums.view, &block.parameters(), group, &screen);
+                if let Some((weights, anchors)) = self.regularize {
+                    let seen = F::Mask::from_bits(active);
+                    zero_unseen(&mut g, seen);
+                    let rows = (self.blocks.rows - group * LANES).min(LANES);
+                    let real = ((1u32 << rows) - 1) as u16 & free;
+                    active |=
+                        anchors.add_gradients(weights, &block.parameters(), group, &mut g) & real;
+                    if active == 0 {
+                        continue;
+                    }
+                }
+                active &= !zero(&g).bits();
+                let good = finite(&g).bits() & active;
+                skipped += (active & !good).count_ones() as usize;
+                updated += good.count_ones() as usize;
+                if good != 0 {
+                    self.step_group(&mut block, good, &g);
+                }
             }
-            active &= !zero(&g).bits();
-            let good = finite(&g).bits() & active;
-            skipped += (active & !good).count_ones() as usize;
-            updated += good.count_ones() as usize;
-            if good != 0 {
-                self.step_group(&mut block, good, &g);
+            if updated > before {
+                // SAFETY: as above, and the last block was dropped.
+                unsafe { self.blocks.find_bounds::<F>(first, last) };
             }
         }
         (updated, skipped)

@@ -2,6 +2,7 @@
 //!
 //! It is an optimisation of rasterize + l1_ssim + torch's Adam with the same result to rounding, but that Gaussians no
 //! pixel of the view touched are left alone (sparse Adam): each has its own count of steps for the bias terms.
+//! Rows whose bounds a view cannot see are not even projected.
 //! Parameters and moments lie in blocks of sixteen Gaussians, attribute by attribute, in Morton order of the means, so
 //! every pass reads whole registers and neighbours in space are neighbours in memory.
 
@@ -210,7 +211,10 @@ impl Trainer {
         self.image.resize(shape.values(), 0.0);
         self.gradient.resize(shape.values(), 0.0);
         self.alpha.resize(camera.width * camera.height, 0.0);
-        let parameters = self.store.parameters();
+        let mut parameters = self.store.parameters();
+        if input.regularizers.is_some() {
+            parameters = parameters.unbounded(); // rows out of view step too
+        }
         let mut image = Image {
             rgb: &mut self.image,
             alpha: &mut self.alpha,

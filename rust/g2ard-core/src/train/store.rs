@@ -1,7 +1,9 @@
 //! Parameters and moments in blocks of sixteen Gaussians, attribute after attribute.
 
 use crate::raster::Params;
+use crate::raster::bounds::{Bounds, GROUPS};
 use crate::raster::disjoint::DisjointSlice;
+use crate::raster::find_bounds::bounds_of;
 use crate::raster::params::Source;
 use crate::raster::simd::{LANES, Lanes, Lanes16};
 use crate::spatial::{codes_in_box, order};
@@ -24,6 +26,8 @@ pub struct Store {
     second: Vec<Lanes16>,
     /// Factors of the means' rate.
     units: Vec<Lanes16>,
+    /// Bounds of every [`GROUPS`] groups of `values`.
+    bounds: Vec<Bounds>,
     steps: Vec<u32>,
     /// An upper bound of `steps`.
     most_steps: u32,
@@ -90,6 +94,7 @@ impl Store {
             first: zeros.clone(),
             second: zeros,
             units: vec![Lanes16([1.0; LANES]); blocks],
+            bounds: Vec::new(),
             steps: vec![0; blocks * LANES],
             most_steps: 0,
             order: order(&codes_in_box(params.means.as_chunks().0)),
@@ -112,7 +117,12 @@ impl Store {
                 store.units[row / LANES].0[row % LANES] = units[from];
             }
         }
+        store.find_bounds();
         Ok(store)
+    }
+
+    fn find_bounds(&mut self) {
+        self.bounds = bounds_of(&self.parameters().unbounded());
     }
 
     pub fn len(&self) -> usize {
@@ -206,6 +216,7 @@ impl Store {
             self.steps[row] = state.steps[self.order[row] as usize];
         }
         self.most_steps = self.steps.iter().copied().max().unwrap_or(0);
+        self.find_bounds();
         Ok(())
     }
 
@@ -213,6 +224,7 @@ impl Store {
     pub(crate) fn parameters(&self) -> ParameterView<'_> {
         ParameterView {
             values: &self.values,
+            bounds: Some(&self.bounds),
             first_group: 0,
             rows: self.rows,
             sh_coeffs: self.sh_coeffs,
@@ -226,6 +238,7 @@ impl Store {
             first: DisjointSlice::new(&mut self.first),
             second: DisjointSlice::new(&mut self.second),
             steps: DisjointSlice::new(&mut self.steps),
+            bounds: DisjointSlice::new(&mut self.bounds),
             units: &self.units,
             rows: self.rows,
             sh_coeffs: self.sh_coeffs,
@@ -237,6 +250,7 @@ impl Store {
 #[derive(Clone, Copy)]
 pub(crate) struct ParameterView<'a> {
     values: &'a [Lanes16],
+    bounds: Option<&'a [Bounds]>,
     /// The group that `values` begin with.
     first_group: usize,
     /// Rows of the whole store.
@@ -245,6 +259,14 @@ pub(crate) struct ParameterView<'a> {
 }
 
 impl ParameterView<'_> {
+    /// The same without bounds: every row is projected in every view.
+    pub fn unbounded(self) -> Self {
+        Self {
+            bounds: None,
+            ..self
+        }
+    }
+
     #[inline(always)]
     fn get<F: Lanes>(&self, group: usize, attribute: usize) -> F {
         let attributes = SH + 3 * self.sh_coeffs;
@@ -264,6 +286,7 @@ pub(crate) struct Blocks<'a> {
     first: DisjointSlice<'a, Lanes16>,
     second: DisjointSlice<'a, Lanes16>,
     steps: DisjointSlice<'a, u32>,
+    bounds: DisjointSlice<'a, Bounds>,
     units: &'a [Lanes16],
     pub rows: usize,
     sh_coeffs: usize,
@@ -308,12 +331,37 @@ impl<'a> Blocks<'a> {
     }
 }
 
+impl Blocks<'_> {
+    /// Finds the bounds of the groups from `first`, a multiple of [`GROUPS`], up to `last` again.
+    ///
+    /// # Safety
+    /// These are groups of the store, and no [`Block`] of them exists.
+    #[inline(always)]
+    pub unsafe fn find_bounds<F: Lanes>(&self, first: usize, last: usize) {
+        let attributes = SH + 3 * self.sh_coeffs;
+        // SAFETY: the caller's promise; there are bounds of every GROUPS groups.
+        unsafe {
+            let count = (last - first) * attributes;
+            let parameters = ParameterView {
+                values: self.values.slice(first * attributes, count),
+                bounds: None,
+                first_group: first,
+                rows: self.rows,
+                sh_coeffs: self.sh_coeffs,
+            };
+            let found = Bounds::of_groups::<F, _>(&parameters, first..last);
+            self.bounds.write(first / GROUPS, found);
+        }
+    }
+}
+
 impl Block<'_> {
     /// Its parameters, for reading.
     #[inline(always)]
     pub fn parameters(&self) -> ParameterView<'_> {
         ParameterView {
             values: self.values,
+            bounds: None,
             first_group: self.group,
             rows: self.rows,
             sh_coeffs: self.sh_coeffs,
@@ -325,6 +373,9 @@ impl Source for ParameterView<'_> {
     #[inline(always)]
     fn len(&self) -> usize {
         self.rows
+    }
+    fn bounds(&self) -> Option<&[Bounds]> {
+        self.bounds
     }
     #[inline(always)]
     fn sh_coeffs(&self) -> usize {

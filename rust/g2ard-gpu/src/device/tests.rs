@@ -252,6 +252,7 @@ impl Sheet {
             sh0,
             sh_n: &[],
             sh_coeffs: 1,
+            bounds: None,
         }
     }
 }

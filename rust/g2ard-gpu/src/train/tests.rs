@@ -74,6 +74,7 @@ impl Arrays {
             sh0: &self.sh0,
             sh_n: &self.sh_n,
             sh_coeffs: self.coeffs,
+            bounds: None,
         }
     }
 

@@ -1,6 +1,7 @@
 //! Projection of a chunk of Gaussians: visible splats and the tiles that they touch.
 
 use super::{Projected, Splat, View, colour, direction, on_image, project};
+use crate::raster::bounds::GROUPS;
 use crate::raster::grid::TileGrid;
 use crate::raster::params::Source;
 use crate::raster::simd::{Kernel, LANES, Lanes, Lanes16, Mask, Wide};
@@ -14,6 +15,8 @@ pub struct Project<'a, S: Source> {
     pub source: S,
     pub first: usize,
     pub last: usize,
+    /// Which of the groups, [`GROUPS`] at a time, the view can see.
+    pub seen: &'a [bool],
     pub grid: TileGrid,
     pub out: &'a mut [Splat],
     pub tile_lists: &'a mut [TileList],
@@ -28,6 +31,9 @@ impl<S: Source> Kernel for Project<'_, S> {
         let mut count = 0;
         self.intersector.clear();
         for group in self.first..self.last {
+            if !self.seen[(group - self.first) / GROUPS] {
+                continue;
+            }
             let p = project::<F, S>(self.view, &self.source, group);
             let real_lanes = (self.source.len() - group * LANES).min(LANES);
             let visible = p.visible.and(p.on_rows(&self.grid));

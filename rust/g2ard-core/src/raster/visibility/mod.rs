@@ -9,6 +9,7 @@ use std::sync::Arc;
 use rayon::prelude::*;
 
 use crate::raster::accumulate::{SQUARED, Total};
+use crate::raster::bounds::Bounds;
 use crate::raster::disjoint::DisjointSlice;
 use crate::raster::frustum::Frustum;
 use crate::raster::grid::TileGrid;
@@ -18,7 +19,7 @@ use crate::raster::simd::LANES;
 use crate::raster::{Camera, Rasterizer, Region, Settings};
 use crate::scene::{Means, Ordered, SceneRef};
 use crate::{Control, Cpu, Error, Result};
-use groups::{Bounds, Group, VisibleGroup, VisibleGroups};
+use groups::{Group, VisibleGroup, VisibleGroups};
 
 /// Kernels over a scene that views look at. An implementation may differ from [`Cpu`]'s within a stated tolerance.
 pub trait VisibilityKernels: Sync {
@@ -366,6 +367,7 @@ mod tests {
             sh0: means.as_flattened(),
             sh_n: &[],
             sh_coeffs: 1,
+            bounds: None,
         };
         let scene = made(&rows);
         let (mut views, mut whole) = (accumulator(&scene), Accumulated::new(means.len()));
