@@ -153,7 +153,7 @@ def anywhere_views(splats: Splats, count: int = _ANYWHERE, seed: int = 0) -> Cam
         InputError: nothing visible in the scene.
     """
     chance = np.random.default_rng(seed + 777)
-    up = Site.of(splats, rows=_ROWS).up.axis
+    up = Site.of(splats, rows=_ROWS).vertical.axis
     means = splats.means.astype(np.float64) + splats.offset
     box = np.quantile(means[splats.opacities > 0.1], [0.02, 0.98], axis=0)
     diagonal = float(np.linalg.norm(box[1] - box[0]))

@@ -145,7 +145,7 @@ def write(path: Path, splats: Splats, *, overwrite: bool = False) -> float:
     elements = [PlyElement.describe(chunk, "chunk"), PlyElement.describe(words, "vertex")]
     if splats.sh_degree:
         elements.append(PlyElement.describe(_harmonics(splats), "sh"))
-    comments = plyfiles.comments_of(splats.offset, splats.render_model, splats.up, splats.axes)
+    comments = plyfiles.comments_of(splats)
     with atomic_output(path, overwrite) as temporary, temporary.open("wb") as file:
         PlyData(elements, byte_order="<", comments=comments).write(file)
     of, shares = np.arange(len(splats)) // _CHUNK_ROWS, _unpacked(words["packed_position"], _VECTOR_BITS)

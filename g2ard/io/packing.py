@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from g2ard.errors import InputError
 from g2ard.io.sanitize import LOG_SCALE_LIMIT
 from g2ard.scene.splats import Splats
-from g2ard.scene.transform import as_stored
+from g2ard.scene.transform import as_stored, moved_axes
 
 _MORTON_BITS = 21
 _NEAR = 4.0  # distance of near rows from the median, as a multiple of the 75th percentile of all distances
@@ -33,8 +33,9 @@ def writable(path: Path, splats: Splats) -> Splats:
 
 
 def own_place(stored: Splats) -> dict[str, Any]:
-    """Return what a file states under "g2ard" of a scene `as_stored`: unusual offset and axes."""
-    own: dict[str, Any] = {"offset": stored.offset.tolist()} if stored.offset.any() else {}
+    """Return what a file states under "g2ard" of a scene `as_stored`: axes, and the offset in these axes."""
+    offset = moved_axes(stored.offset, "RDF", stored.axes)
+    own: dict[str, Any] = {"offset": offset.tolist()} if offset.any() else {}
     return own if stored.axes == "RDF" else {**own, "axes": stored.axes}
 
 

@@ -2,7 +2,6 @@
 
 import re
 from collections.abc import Iterable, Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +18,7 @@ from g2ard.io.stream import RawStream, SceneStream
 from g2ard.io.types import Note
 from g2ard.progress import plural
 from g2ard.scene.splats import SH_C0, Splats, far_middle, unit_quats
-from g2ard.scene.transform import as_stored
+from g2ard.scene.transform import as_stored, stand_as
 
 _MEANS = ["x", "y", "z"]
 _DC = ["f_dc_0", "f_dc_1", "f_dc_2"]
@@ -246,7 +245,7 @@ def write(
     names += [f"f_rest_{k}" for k in range(3 * ((degree + 1) ** 2 - 1))]
     names += ["opacity", *_SCALES, *_QUATS]
     blocks = _blocks(path, (part.with_sh_degree(degree) for part in parts), names, normals)
-    comments = plyfiles.comments_of(frame.offset, frame.render_model, frame.up, frame.axes)
+    comments = plyfiles.comments_of(frame)
     if layout == "inria":
         comments = comments[1:]  # those that carry values: importers by position may count lines
     plyfiles.write_rows(path, dict.fromkeys(names, "<f4"), count, blocks, overwrite, comments)
@@ -256,11 +255,8 @@ def write(
 def _nothing_of(scene: SceneStream) -> Splats:
     """Return a scene without rows that stands as the stream does."""
     nothing = np.zeros((0, 3))
-    return replace(
-        Splats.create(nothing, scales=nothing, offset=scene.offset, render_model=scene.render_model),
-        up=scene.up,
-        axes=scene.axes,
-    )
+    empty = Splats.create(nothing, scales=nothing, offset=scene.offset, render_model=scene.render_model)
+    return stand_as(empty, scene)
 
 
 def _blocks(

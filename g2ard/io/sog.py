@@ -31,7 +31,7 @@ from g2ard.io.sanitize import BLOCK, Raw, logits_of
 from g2ard.io.stream import RawStream, from_row
 from g2ard.io.types import Note
 from g2ard.progress import plural
-from g2ard.scene.transform import one_model
+from g2ard.scene.transform import moved_axes, one_model
 
 _COEFFICIENTS = {0: 0, 1: 3, 2: 8, 3: 15}
 _LARGEST_FLOAT32 = float.fromhex("0x1.fffffep+127")  # largest float32
@@ -399,7 +399,8 @@ class Stream(RawStream):
             own = _own(chunks)
             model = one_model([chunk.meta.render_model for chunk in chunks] or ["classic"])
         notes = tuple(_left_out(path, len(chunks)))
-        super().__init__(path, sum(self._counts), self._rest, np.array(own.offset, np.float64), notes, model)
+        offset = moved_axes(own.offset, own.axes, "RDF")
+        super().__init__(path, sum(self._counts), self._rest, offset, notes, model)
         self.restore(own.axes)
 
     def identity(self) -> list[Any]:

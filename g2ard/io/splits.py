@@ -197,14 +197,14 @@ _SAME_POSE = 1e-6
 
 
 def same_photos(
-    photos: Sequence[Path | None], others: Sequence[Path | None], *, copies: bool = False
+    files: Sequence[Path | None], others: Sequence[Path | None], *, copies: bool = False
 ) -> NDArray[np.bool_]:
     """Return whether each photo is one of `others`, by whatever name; with `copies`, also by content."""
     known = {real_path(path) for path in others if path is not None}
-    alike = np.array([path is not None and real_path(path) in known for path in photos], bool)
+    alike = np.array([path is not None and real_path(path) in known for path in files], bool)
     if copies:
         sizes, hashes = {_size(path) for path in known}, set[str]()
-        for row, path in enumerate(photos):
+        for row, path in enumerate(files):
             if path is not None and not alike[row] and _size(path) in sizes - {None}:
                 hashes = hashes or {content_hash(other) for other in known if _size(other) is not None}
                 alike[row] = content_hash(path) in hashes

@@ -29,7 +29,7 @@ from g2ard.io.sanitize import Raw, cleaned, logits_of
 from g2ard.io.types import Note, Noted
 from g2ard.progress import Progress, plural, silent
 from g2ard.scene.splats import Splats
-from g2ard.scene.transform import change_of_axes, harmonic_signs, restored, with_axes
+from g2ard.scene.transform import change_of_axes, harmonic_signs, moved_axes, restored, with_axes
 
 _MAGIC = b"NGSP"
 _HEADER = 16  # size of the header, bytes
@@ -129,7 +129,7 @@ def _in_place(path: Path, scene: Splats, own: bytes) -> Splats:
     place = checked(parse_json(path, own.decode("latin-1")), _Comment, JsonPlace(path)).g2ard
     if place.stored != "RUB":
         scene = with_axes(scene, change_of_axes(place.stored, "RUB"))
-    return restored(replace(scene, offset=np.array(place.offset, np.float64)), place.axes)
+    return restored(replace(scene, offset=moved_axes(place.offset, place.axes, "RDF")), place.axes)
 
 
 def _comment(data: bytes) -> bytes:

@@ -20,7 +20,7 @@ from g2ard.io.sanitize import BLOCK, Raw, Tally
 from g2ard.io.types import Cloud, Note, Points
 from g2ard.progress import plural
 from g2ard.scene.splats import ARRAYS, Splats
-from g2ard.scene.transform import change_of_axes, common_axes, one_model, restored
+from g2ard.scene.transform import change_of_axes, common_axes, one_model, restored, stand_as
 
 _DEGREE_OF_REST = {0: 0, 3: 1, 8: 2, 15: 3}
 _POINTS_AT_ONCE = 1 << 20
@@ -150,7 +150,7 @@ class RawStream(SceneStream):
         for raw in self.raw(rows, start):
             before, keep = self.tally.dropped, self.tally.clean(raw)
             splats = restored(raw.activated(self.render_model, np.zeros(3)), self.axes)
-            splats = replace(splats, offset=self.offset, up=self.up)
+            splats = stand_as(replace(splats, offset=self.offset), self)
             yield splats if self.tally.dropped == before else splats.take(keep)
 
 

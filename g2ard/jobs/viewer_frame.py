@@ -193,7 +193,7 @@ def up_of(scene: Splats, up: Sequence[float] | None = None) -> NDArray[np.float6
     if up is not None:
         return unit_up(up)
     try:
-        return Site.of(scene, None, _SAMPLE).up.axis
+        return Site.of(scene, None, _SAMPLE).vertical.axis
     except InputError:  # nothing visible
         return np.array([0.0, -1.0, 0.0])
 

@@ -218,8 +218,8 @@ def plan_pool(
     return Pool(
         survey.cameras(poses.take(order)),
         " + ".join(used),
-        f"{why}; {site.up.why}",
-        site.up.axis,
+        f"{why}; {site.vertical.why}",
+        site.vertical.axis,
         unseen=float((reach[0] < 0).mean()),
         coarse=float(reach[2].mean()),
         more=more,

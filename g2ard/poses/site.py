@@ -93,7 +93,7 @@ class Site:
         axes: (3, 3) rows are this frame's axes in world coordinates.
         origin: (3,) in world coordinates.
         size: scene units per unit here.
-        up: the up direction, and the reason for it.
+        vertical: the up direction, and the reason for it.
         beyond: (F, 3) a sample of what is not near: sky, surroundings, floaters.
         beyond_share: share of the visible Gaussians that are not near.
         centre: (3,) the middle of the places from which people looked at the scene.
@@ -109,7 +109,7 @@ class Site:
     axes: Floats
     origin: Floats
     size: float
-    up: Up
+    vertical: Up
     beyond: Floats
     beyond_share: float
     centre: Floats
@@ -149,7 +149,7 @@ class Site:
             axes=axes,
             origin=origin,
             size=matter.size,
-            up=found,
+            vertical=found,
             beyond=turned(matter.beyond, axes),
             beyond_share=matter.beyond_share,
             centre=turned(matter.centre[None], axes)[0],
@@ -201,7 +201,7 @@ class Site:
         places = places[(around > _ENCLOSED) & (sharp > _MOSTLY * around)]
         places = places[np.argsort(-self.grid.distance(places), kind="stable")]
         share = len(places) / _TRIES
-        weight = float(np.interp(share, _ROOMS, (0.0, 1.0 if self.up.grounded else _SHELL)))
+        weight = float(np.interp(share, _ROOMS, (0.0, 1.0 if self.vertical.grounded else _SHELL)))
         return Inside(places, share, weight)
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -304,6 +304,30 @@ def as_stored(splats: Splats) -> Splats:
     """
     near = splats.narrowed()
     return near if near.axes == "RDF" else with_axes(near, change_of_axes(near.axes, "RDF"))
+
+
+class HasAxes(Protocol):
+    """A scene, or a store or stream of one."""
+
+    @property
+    def up(self) -> tuple[float, float, float] | None: ...
+
+    @property
+    def axes(self) -> Axes: ...
+
+
+def stand_as(splats: Splats, other: HasAxes) -> Splats:
+    """Return a scene with the axes and the up direction of another one, without turning anything."""
+    return replace(splats, up=other.up, axes=other.axes)
+
+
+def moved_axes(offset: ArrayLike, source: Axes, target: Axes) -> NDArray[np.float64]:
+    """Return a (3,) offset in other axes, exactly.
+
+    >>> moved_axes([5.0, 7.0, 2.0], "RFU", "RDF").tolist()
+    [5.0, -2.0, 7.0]
+    """
+    return change_of_axes(source, target) @ np.asarray(offset, np.float64) + 0.0
 
 
 def restored(splats: Splats, axes: Axes) -> Splats:

@@ -105,7 +105,7 @@ def guessed_axes(positions: NDArray[np.float64]) -> Axes:
     some = positions[:: max(1, len(positions) // _GUESSED_BY)]
     discs, _ = lift_rows(some, np.full(some.shape, 0.5), LiftConfig())
     try:
-        up = Site.of(discs, None, _GUESSED_BY).up.axis
+        up = Site.of(discs, None, _GUESSED_BY).vertical.axis
     except InputError:  # nothing to see
         return "RDF"
     systems: tuple[Axes, ...] = ("RDF", "RFU", "RUB")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +23,7 @@ from g2ard.rendering.targets import Cached, Targets, unrounded
 from g2ard.rendering.visibility import LONGEST
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats
+from g2ard.scene.transform import stand_as
 from g2ard.stages.simplify import SimplifyConfig
 from g2ard.stages.simplify.gaps import let_through, some_views
 from g2ard.stages.simplify.pairs import MANY
@@ -76,7 +77,7 @@ class InTiles:
     @cached_property
     def sample(self) -> Splats:
         """A sample of the Gaussians, from all tiles."""
-        return replace(self._run.sample(), up=self.store.up, axes=self.store.axes)
+        return stand_as(self._run.sample(), self.store)
 
     @cached_property
     def _run(self) -> TiledRun:

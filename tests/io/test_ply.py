@@ -374,7 +374,7 @@ def test_the_up_direction_of_comments(tmp_path: Path, comments: list[str], up: A
     if up is None:
         return
     np.testing.assert_allclose(up_of(again), up, atol=1e-12)
-    np.testing.assert_allclose(Site.of(again).up.axis, up, atol=1e-12)
+    np.testing.assert_allclose(Site.of(again).vertical.axis, up, atol=1e-12)
     turned = convert(path, rotate=(90, 0, 0))
     np.testing.assert_allclose(up_of(turned), (up[0], -up[2], up[1]), atol=1e-12)
     mirrored = convert(path, to_axes="LDF")
