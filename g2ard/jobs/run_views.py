@@ -143,6 +143,8 @@ def views_of(
     else:
         train, test = replace(train, cameras=as_pool(train.cameras)), as_pool(test)
     full = shrunk(test, options.size)
+    if options.size is not None and options.photos is False:  # photos that are not read do not limit it
+        train, test = replace(train, cameras=train.cameras.scaled(options.size)), test.scaled(options.size)
     train, test = train.fitted(options.size), test.fitted(options.size)
     if not teach or any(train.cameras.image_paths):
         if options.config.select.focus:
