@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 from g2ard.config.checks import AtLeastOne, NotNegative, Within, checks_arguments
 from g2ard.config.choices import AdaptSchedule
 from g2ard.errors import InputError
-from g2ard.io.reports import Report
+from g2ard.io.reports import LEFT_OUT, Report
 from g2ard.pipeline.steps import Steps
 from g2ard.progress import Progress, plural, silent
+from g2ard.rendering.exposure import Exposure
 from g2ard.rendering.renderer import Renderer
 from g2ard.rendering.targets import Targets, checked_targets, mask_of
 from g2ard.rendering.visibility import visibility
@@ -236,9 +237,10 @@ class AdaptReport(Report):
 
     Args:
         converged: whether the last stretch gained less than the tolerance.
-        psnr: PSNR before and after, on a sample of the training views.
+        psnr: PSNR before and after, on a sample of the training views; all are measured alike.
         colour_change: gain (dB), matrix and shift of the change of all colours; None if it was not applied.
         prior_share: mean share of the previous appearance in the result.
+        exposure: what was last estimated of the photos' exposures; None if they agree.
     """
 
     steps: int
@@ -248,6 +250,7 @@ class AdaptReport(Report):
     stretches: tuple[Stretch, ...]
     colour_change: dict[str, Any] | None
     prior_share: float
+    exposure: Exposure | None = field(default=None, metadata=LEFT_OUT)
 
 
 @dataclass(frozen=True, eq=False)
@@ -268,10 +271,11 @@ class Adapted(Shown):
 
 def _fit(
     start: Splats, targets: Targets, config: AdaptConfig, steps: Steps, progress: Progress
-) -> tuple[Splats, list[RecoverReport]]:
-    """Recover with frozen geometry in stretches, until one gains less than the tolerance."""
+) -> tuple[list[Splats], list[RecoverReport]]:
+    """Recover with frozen geometry until a stretch gains less than the tolerance; return each one's scene."""
     scene, before, images = start, 0, len(targets.cameras)
     most = config.most_steps(images)
+    scenes: list[Splats] = []
     reports: list[RecoverReport] = []
 
     def told(stage: str, done: int, total: int, info: Mapping[str, Any] | None = None) -> None:
@@ -291,12 +295,13 @@ def _fit(
         tell = silent if progress is silent else told
         new, report = steps.recover(name, scene, targets, how, progress=tell, stage="adapt")
         scene = replace(scene, logit_opacities=new.logit_opacities, sh0=new.sh0, shN=new.shN)
+        scenes.append(scene)
         reports.append(report)
         before += length
         if report.psnr.after - report.psnr.before < config.tolerance:
             break
     progress("adapt", before, before, {})
-    return scene, reports
+    return scenes, reports
 
 
 @checks_arguments
@@ -349,15 +354,18 @@ def adapt(
         change = colour_change(given, targets, config.background)
         change = change if change.gain >= config.colour_worth else None
         start = given if change is None else recoloured(given, change)
-    fitted, fits = _fit(start, targets, config, Steps(work, progress), progress)
+    scenes, fits = _fit(start, targets, config, Steps(work, progress), progress)
     progress("adapt", 0, 0)
     if config.prior_views:
         seen = views_seeing(start, targets.cameras)
         share = seen / (seen + config.prior_views)
-    result = blended_appearance(start, fitted, share)
+    result = blended_appearance(start, scenes[-1], share)
+    exposure = next((fit.exposure for fit in reversed(fits) if fit.exposure), None)
+    if exposure is not None:
+        probe.fit_exposures()
     changed = None if change is None else {k: np.asarray(v).tolist() for k, v in vars(change).items()}
-    taken = zip(config.stretches(len(targets.cameras)), fits, strict=False)
-    stretches = tuple(Stretch(steps, fit.psnr.after) for steps, fit in taken)
+    taken = zip(config.stretches(len(targets.cameras)), scenes, strict=False)
+    stretches = tuple(Stretch(steps, probe.all_of(scene)) for steps, scene in taken)
     report = AdaptReport(
         steps=sum(stretch.steps for stretch in stretches),
         seconds=sum(fit.seconds for fit in fits),
@@ -366,5 +374,6 @@ def adapt(
         stretches=stretches,
         colour_change=changed,
         prior_share=float(1 - share.mean()),
+        exposure=exposure,
     )
     return Adapted(result, report)

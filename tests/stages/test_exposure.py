@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 
 import g2ard
+from g2ard.pipeline.adapt import AdaptConfig, adapt
 from g2ard.rendering.exposure import exposures_of, rendered, unexposed
-from g2ard.rendering.targets import Exposed, Photos, PhotosOrRenders
+from g2ard.rendering.targets import Exposed, Photos, PhotosOrRenders, Subset
 from g2ard.scene.cameras import Cameras
+from g2ard.scene.samples import evenly_spaced
 from g2ard.stages.evaluate import evaluate
 from g2ard.stages.recover.config import RecoverConfig
 from g2ard.stages.recover.engine import FusedEngine
@@ -132,11 +134,12 @@ def test_commands_say_what_was_undone(tmp_path: Path, command_line: CommandLine)
     for name, gains in (("equal", np.ones(12)), ("unequal", GAINS)):
         g2ard.save_views(tmp_path / f"{name}.json", taken(name, gains))
     recovered = ["recover", "scene.ply", "--steps", "100", "-o"]
+    adapted = ["adapt", "scene.ply", "--steps", "100", "-o"]
     distilled = ["distill", "scene.ply", "-n", "700", "--steps", "100", "--no-page", "-o"]
-    for command in (recovered, distilled):
+    for command in (recovered, adapted, distilled):
         told = []
         for name in ("equal", "unequal"):
-            output = f"{command[0]}-{name}{'.ply' * (command[0] == 'recover')}"
+            output = f"{command[0]}-{name}{'.ply' * (command[0] != 'distill')}"
             printed = succeeds(command_line, tmp_path, *command, output, "--views", f"{name}.json")
             told.append("".join(printed))
         assert "exposure" not in told[0]
@@ -144,6 +147,23 @@ def test_commands_say_what_was_undone(tmp_path: Path, command_line: CommandLine)
     report = (tmp_path / "distill-unequal/report.json").read_text()
     assert '"exposure"' in report
     assert "differ in exposure" in (tmp_path / "distill-unequal/report.html").read_text()
+
+
+@pytest.mark.parametrize("kind", ["equal", "exposure"])
+def test_all_figures_of_an_adaptation_are_measured_alike(kind: str) -> None:
+    """After a fit of exposures if photos differ, and without one if they agree."""
+    targets: Any = photos(KINDS.get(kind, np.ones(12)))
+    config = AdaptConfig(steps=160, first_stretch=80, tolerance=0, prior_views=0)
+    done = adapt(start(), targets, config)
+    assert (done.report.exposure is not None) == (kind == "exposure")
+    if done.report.exposure is not None:
+        assert done.report.as_dict()["exposure"]["photos"].keys() == set(VIEWS.names)
+    some = Subset(targets, evenly_spaced(12, 8))
+    shown = Exposed(some) if kind == "exposure" else some
+    scores = [evaluate(splats, shown).psnr for splats in (start(), done.splats)]
+    told = done.report.psnr
+    np.testing.assert_allclose([told.before, told.after], scores, atol=1e-3)
+    np.testing.assert_allclose(done.report.stretches[-1].psnr, told.after, atol=1e-3)
 
 
 @pytest.mark.parametrize(("gain", "differ"), [(0.97, False), (0.75, True)])

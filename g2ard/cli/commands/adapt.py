@@ -84,6 +84,8 @@ def adapt(
         result = refit(splats, targets, config, work=work, progress=run.progress)
         run.write(output, result.splats)
     gain, end = result.report.psnr, "converged" if result.report.converged else "all steps taken"
+    if result.report.exposure is not None:
+        run.say(str(result.report.exposure))
     run.say(
         f"{output}: {plural(len(splats), 'Gaussian')}, {plural(result.report.steps, 'step')} ({end}), "
         f"{opt.trained_on(split)} {targets.cameras.size_text}: {gain.before:.2f} → {gain.after:.2f} dB"
