@@ -19,7 +19,7 @@ SOURCES = [
     if "node_modules" not in path.parts and path.stem not in ("machines", "test_machines")
 ]
 TEXTS = {str(path.relative_to(ROOT)): path.read_text(encoding="utf-8") for path in SOURCES}
-DEVELOPERS = {"packaging", "pty", "pyte", "torch"}
+DEVELOPERS = {"jedi", "packaging", "pty", "pyte", "torch"}
 """Modules that are there wherever the tests run, or that only the system decides on."""
 SWITCHES = {"G2ARD_REQUIRE_GPU", "G2ARD_SCENE", "G2ARD_COMPLETE", "G2ARD_NOWHERE"}
 """Variables that ask for something, and tell of nothing that a machine has."""

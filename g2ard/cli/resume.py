@@ -24,7 +24,6 @@ from g2ard.io.jsonfile import read_json
 from g2ard.io.lock import check_unlocked, lock_file, locked
 from g2ard.io.paths import file_identity, real_path, user_cache
 from g2ard.io.scene_formats import files_of
-from g2ard.system.keys import key_of
 
 OPTIONS = "options.json"
 """File in a folder of checkpoints with the options of their run."""
@@ -99,6 +98,8 @@ def record_of(output: Path) -> dict[str, Any] | None:
 
 def _record_file(output: Path) -> Path:
     """Return the file in the user's cache for the record of a finished output."""
+    from g2ard.system.keys import key_of
+
     return user_cache() / "finished" / f"{key_of(str(real_path(output)))}.json"
 
 

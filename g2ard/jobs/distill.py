@@ -774,7 +774,7 @@ def _read(
         cloud, name, _ = _points(scene, None, say)
         assert cloud is not None
         xyz, rgb = cloud.points.positions, cloud.points.colors
-        axes = axes_of(cloud, name, say)
+        axes = axes_of(cloud, name, say, progress)
         lifted = lift(xyz, rgb, axes=axes, **vars(options.config.lift), progress=progress)
         return _Read(InMemory(lifted), True, False, options.beside, name, len(lifted))
     cloud, name, of_photos = _points(scene, views, say)

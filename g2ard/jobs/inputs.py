@@ -25,7 +25,7 @@ from g2ard.io.splits import (
     states_splits,
 )
 from g2ard.io.types import Cloud, ViewFiles, ViewSet
-from g2ard.progress import Say, plural, unsaid
+from g2ard.progress import Progress, Say, plural, silent, unsaid
 from g2ard.rendering.renderer import RasterSettings
 from g2ard.rendering.targets import Photos, PhotosOrRenders, Targets, TeacherRenders, with_pixels
 from g2ard.scene.cameras import Cameras
@@ -77,11 +77,11 @@ def load_scene(
     return splats
 
 
-def axes_of(cloud: Cloud, name: str, say: Say = unsaid) -> Axes:
+def axes_of(cloud: Cloud, name: str, say: Say = unsaid, progress: Progress = silent) -> Axes:
     """Return the axes of a cloud's coordinates; if neither its format nor a map tells, guess and say so."""
     if cloud.axes is not None:
         return cloud.axes
-    axes = guessed_axes(cloud.points.positions)
+    axes = guessed_axes(cloud.points.positions, progress)
     up = "xyz"[int(np.argmax(np.abs(up_in(axes))))]
     sign = "−" if min(up_in(axes)) < 0 else ""
     say(f"note: {name}: {sign}{up} is taken for up, a guess from its surfaces; results stand upright by it")

@@ -267,7 +267,7 @@ def reducing(
         for note in cloud.notes:
             say(f"{scene}: {note}")
         points, notes = cloud.points, cloud.notes
-        axes = axes_of(cloud, str(scene), say)
+        axes = axes_of(cloud, str(scene), say, progress)
         splats = lift(points.positions, points.colors, axes=axes, progress=progress)
         discs = plural(len(splats), "disc")
         say(f"{scene}: {plural(len(points), 'point')} lifted to {discs}, as `g2ard lift` does")

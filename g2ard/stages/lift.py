@@ -100,10 +100,10 @@ def in_axes(splats: Splats, axes: Axes) -> Splats:
     return splats if axes == "RDF" else replace(splats, axes=axes)
 
 
-def guessed_axes(positions: NDArray[np.float64]) -> Axes:
+def guessed_axes(positions: NDArray[np.float64], progress: Progress = silent) -> Axes:
     """Guess the axes of points by their ground: z up, y up, or those of photos, y down."""
     some = positions[:: max(1, len(positions) // _GUESSED_BY)]
-    discs, _ = lift_rows(some, np.full(some.shape, 0.5), LiftConfig())
+    discs, _ = lift_rows(some, np.full(some.shape, 0.5), LiftConfig(), progress)
     try:
         up = Site.of(discs, None, _GUESSED_BY).vertical.axis
     except InputError:  # nothing to see
@@ -141,6 +141,7 @@ def lift_rows(
     if merge:
         firsts, rgb = merged(centered, rgb)
         xyz, centered, rows = xyz[firsts], centered[firsts], rows[firsts]
+    progress("lift", 0, len(xyz))
     quats, scales = _core.lift_points(xyz - _anchor(xyz), config, counter(progress, "lift"))
     n = len(centered)
     step = np.spacing(np.float32(np.abs(xyz).max()))

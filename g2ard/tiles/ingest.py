@@ -132,7 +132,7 @@ def ingest(
                     tiles = plural(over, "tile")
                     text = f"{tiles} of more than {tile_rows:,} Gaussians: many share one position"
                     notes.append(Note("overfull_tiles", over, text))
-                writer.finish(key, _manifest(stream, sources, settings, notes))
+                writer.finish(key, _manifest(stream, sources, settings, notes, progress))
             except BaseException:
                 clear(folder)
                 raise
@@ -142,7 +142,11 @@ def ingest(
 
 
 def _manifest(
-    stream: SceneStream | PointStream, sources: list[str], settings: dict[str, Any], notes: list[Note]
+    stream: SceneStream | PointStream,
+    sources: list[str],
+    settings: dict[str, Any],
+    notes: list[Note],
+    progress: Progress,
 ) -> dict[str, Any]:
     """Describe what the tiles hold."""
     scene = stream if isinstance(stream, SceneStream) else None
@@ -156,7 +160,7 @@ def _manifest(
     }
     if isinstance(stream, PointStream):
         system = {} if stream.system is None else {"system": stream.system}
-        return {**manifest, "axes": stream.axes or guessed_axes(stream.sample), **system}
+        return {**manifest, "axes": stream.axes or guessed_axes(stream.sample, progress), **system}
     return {**manifest, "axes": stream.axes} | ({} if stream.up is None else {"up": stream.up})
 
 

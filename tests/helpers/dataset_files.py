@@ -112,7 +112,7 @@ def mip_nerf_360(root: Path) -> None:
         q, t = quaternion(view[:3, :3]), view[:3, 3]
         rows.append(" ".join(map(str, (i + 1, *q, *t, 1, f"DSC{i:04d}.JPG"))) + "\n\n")
         for folder, size in (("images", (400, 300)), ("images_2", (200, 150)), ("images_4", (100, 75))):
-            photo(root / folder / f"DSC{i:04d}.JPG", size)
+            photo(root / folder / f"DSC{i:04d}.JPG", size, red=20 * i)
     (model / "images.txt").write_text("".join(rows))
 
 

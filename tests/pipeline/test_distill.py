@@ -49,7 +49,7 @@ def test_only_steps_of_a_changed_setting_or_a_damaged_file_are_repeated(
 ) -> None:
     config = DistillConfig(recover=RecoverConfig(steps=20))
     first = distill(PRIOR, 300, targets, config, work=tmp_path)
-    monkeypatch.setattr("g2ard.pipeline.distill.simplify", None)
+    monkeypatch.setattr("g2ard.pipeline.dense.simplify", None)
     again = distill(PRIOR, 300, targets, changed(config, {"recover.steps": 9}), work=tmp_path)
     assert again.report.rounds[0].simplify == first.report.rounds[0].simplify
     assert again.report.rounds[0].recover[0].steps == 9
@@ -160,7 +160,7 @@ def test_command_on_a_cloud_with_photos(command_line: CommandLine, tmp_path: Pat
     assert report["apart"] is None  # photos are only where they were taken
     assert 0 <= report["unseen"] < 0.05
     simplified, recovered = (report["scores"][stage]["psnr"] for stage in ("simplified", "recovered"))
-    assert simplified > 21.3
+    assert simplified > 20.5
     assert recovered > max(21.5, simplified)
     result = read_splats(tmp_path / "run" / "scene.ply")
     assert (len(result), result.sh_degree) == (400, 3)

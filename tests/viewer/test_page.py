@@ -258,7 +258,9 @@ def test_a_run_has_a_page_unless_too_large(tmp_path: Path, monkeypatch: pytest.M
     config = {"keep": False, "views_format": "g2ard"}
     run = SimpleNamespace(write=lambda scene, splats, **_: write_splats(scene, splats), config=config)
     views = RunViews(ViewSet(around(4)), around(2))
-    RunFolder(run, tmp_path / "run", "scene.sog", resume=False).write(SimpleNamespace(splats=ball), views)
+    RunFolder(run, tmp_path / "run", "scene.sog", resume=False).write(
+        SimpleNamespace(splats=ball), views, SimpleNamespace(apart=None)
+    )
     assert not path.exists()  # a page of an earlier run
     monkeypatch.setitem(budget.DEVICES, "web", 299)
     size, line = folder.write_view(ball, None, around(6), (1.0, 1.0, 1.0))

@@ -48,7 +48,7 @@ def lift(
         normal_ratio=normal_ratio,
         max_anisotropy=max_anisotropy,
         opacity=opacity,
-        axes=axes_of(found, str(cloud), run.say),
+        axes=axes_of(found, str(cloud), run.say, run.progress),
         progress=run.progress,
     )
     lifted = time.perf_counter()
