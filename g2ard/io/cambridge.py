@@ -4,7 +4,6 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from g2ard.errors import InputError, damaged
 from g2ard.io.colmap import parsing
@@ -12,7 +11,7 @@ from g2ard.io.finding import Finder
 from g2ard.io.jsonfile import Place
 from g2ard.io.paths import read_text
 from g2ard.io.photos import Frame, Lens, Listed, photo_size, posed
-from g2ard.io.types import Note, ViewFiles
+from g2ard.io.types import Float, Note, ViewFiles
 
 _PHOTO_SIZE = (1920, 1080)  # size of the original photos, for which focal lengths are given
 _SPLIT_FILES = {"train": "dataset_train.txt", "test": "dataset_test.txt"}
@@ -49,9 +48,7 @@ def read(views: ViewFiles) -> Listed:
     return Listed(path, frames, notes=(Note("guessed_focal", guessed, text),) if guessed else ())
 
 
-def _frame(
-    where: Path, name: str, pose: NDArray[np.float64], lens: tuple[float, float], photo: Path, split: str
-) -> Frame:
+def _frame(where: Path, name: str, pose: Float, lens: tuple[float, float], photo: Path, split: str) -> Frame:
     width, height = photo_size(photo, where) if photo.is_file() else _PHOTO_SIZE
     view = posed(pose[3:], (0, 0, 0))
     view[:3, 3] = -view[:3, :3] @ pose[:3]
@@ -84,9 +81,9 @@ def _lenses(path: Path) -> dict[str, tuple[float, float]]:
     return lenses
 
 
-def read_ace(path: Path) -> dict[str, NDArray[np.float64]]:
+def read_ace(path: Path) -> dict[str, Float]:
     """Read ACE's lines `NAME qw qx qy qz tx ty tz …` as photo → (4, 4) camera_from_world."""
-    out: dict[str, NDArray[np.float64]] = {}
+    out: dict[str, Float] = {}
     for place, name, numbers in _lines(path):
         if not numbers[:4].any():
             raise place.error("has a quaternion of length zero")
@@ -98,7 +95,7 @@ def read_ace(path: Path) -> dict[str, NDArray[np.float64]]:
     return out
 
 
-def _lines(path: Path, heading: int = 0) -> Iterator[tuple[Place, str, NDArray[np.float64]]]:
+def _lines(path: Path, heading: int = 0) -> Iterator[tuple[Place, str, Float]]:
     """Yield the name and the seven numbers of each line after a heading of lines.
 
     Empty lines and lines that begin with # are skipped.

@@ -2,10 +2,8 @@
 
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from g2ard.errors import InputError
 from g2ard.io import judge
@@ -22,7 +20,7 @@ from g2ard.io.plyfiles import (
 )
 from g2ard.io.signs import MESH
 from g2ard.io.stream import MarkedPoints, Names, PointStream, telling
-from g2ard.io.types import Points
+from g2ard.io.types import Float32, Points, Values
 
 _POSITION = ["x", "y", "z"]
 
@@ -67,7 +65,7 @@ class Stream(PointStream):
         for _, block in row_blocks(self.path, self._vertices, rows, start):
             yield self._marked(block)
 
-    def _marked(self, rows: NDArray[Any]) -> MarkedPoints:
+    def _marked(self, rows: Values) -> MarkedPoints:
         """Return positions, (n, 3) colours, (n, 1) intensities or (n, 0), and that none is noise."""
         columns = [rows[self._named[name]] for name in self._names]
         if len(columns) == 3:
@@ -80,7 +78,7 @@ class Stream(PointStream):
             return positions, np.stack([noise, *columns], axis=1)[:, 1:].astype(np.float32), noise
 
 
-def _color(path: Path, values: NDArray[Any], name: str) -> NDArray[np.float32]:
+def _color(path: Path, values: Values, name: str) -> Float32:
     finite = values[np.isfinite(values)] if values.dtype.kind == "f" else values
     scales = judge.full_scales(values.dtype)
     low, top = float(finite.min(initial=0)), float(finite.max(initial=0))
@@ -95,7 +93,7 @@ def write_blocks(path: Path, count: int, blocks: Iterable[Points], *, overwrite:
     """Write a binary .ply of `count` points that arrive in blocks: float64 positions, 8-bit colours."""
     types = dict.fromkeys(_POSITION, "<f8") | dict.fromkeys(COLOR_NAMES[0], "u1")
 
-    def rows_of(points: Points) -> NDArray[Any]:
+    def rows_of(points: Points) -> Values:
         if not (np.isfinite(points.positions).all() and np.isfinite(points.colors).all()):
             raise InputError("not written: a point is not finite", path=path)
         rows = np.empty(len(points), list(types.items()))

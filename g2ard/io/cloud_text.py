@@ -6,13 +6,13 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from g2ard.errors import InputError, damaged
 from g2ard.io import judge
 from g2ard.io.paths import decoded, plain_numbers, read_text
 from g2ard.io.signs import is_table
 from g2ard.io.stream import MarkedPoints, PointStream
+from g2ard.io.types import Float
 
 _COLUMNS = {
     "x": r"x|x_coord\w*|east\w*",
@@ -89,7 +89,7 @@ def check_points(path: Path) -> None:
         raise InputError(f"has no columns x, y and z (found {' '.join(names)})", path=path)
 
 
-def _text(path: Path, text: str) -> tuple[list[str], NDArray[np.float64]]:
+def _text(path: Path, text: str) -> tuple[list[str], Float]:
     """Return the names of the columns and the rows of a text, with or without a heading.
 
     Of a table whose heading names x, y and z, only known columns are read, and their names are the first.
@@ -134,7 +134,7 @@ def _names(heading: str) -> list[str]:
     return [usual.get(word, word) for word in words]
 
 
-def _unnamed(path: Path, table: NDArray[np.float64]) -> list[str]:
+def _unnamed(path: Path, table: Float) -> list[str]:
     """Return the names of columns without a heading, by their number and values."""
     count = table.shape[1]
     whole = [bool((values == np.rint(values)).all()) for values in table.T]
@@ -157,7 +157,7 @@ def _unnamed(path: Path, table: NDArray[np.float64]) -> list[str]:
     return names
 
 
-def _pcd(path: Path) -> tuple[list[str], NDArray[np.float64]]:
+def _pcd(path: Path) -> tuple[list[str], Float]:
     """Return the names of the fields and the rows of a .pcd; a packed `rgb` becomes three columns."""
     data = path.read_bytes()
     found = re.search(rb"^DATA[ \t]+(\w+)[ \t]*\r?\n", data, re.MULTILINE)
@@ -187,7 +187,7 @@ def _pcd(path: Path) -> tuple[list[str], NDArray[np.float64]]:
         raise
     except (KeyError, ValueError, IndexError, TypeError) as error:
         raise damaged(f"cannot be read as .pcd ({error})", path=path) from error
-    names, columns = list[str](), list[NDArray[np.float64]]()
+    names, columns = list[str](), list[Float]()
     for field, name in zip(fields, rows.names or (), strict=False):
         own = table[name].reshape(len(table), -1)
         if field.lower() in ("rgb", "rgba") and own.dtype.itemsize == 4:

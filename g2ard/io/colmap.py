@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any, NamedTuple, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from g2ard.errors import InputError, damaged
 from g2ard.io.finding import Finder, files_in
@@ -20,7 +19,7 @@ from g2ard.io.jsonfile import Place
 from g2ard.io.paths import read_text
 from g2ard.io.photos import Frame, Lens, Listed, posed
 from g2ard.io.transforms import intrinsics_of
-from g2ard.io.types import Note, ViewFiles
+from g2ard.io.types import Float, Note, ViewFiles
 from g2ard.progress import plural
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.lenses import PARAMETERS, PhotoLens
@@ -452,7 +451,7 @@ def _images(table: Table) -> list[tuple[str, int, int, list[float], InputError |
     return images
 
 
-def _rig_poses(folder: Path, suffix: str) -> dict[tuple[int, int], NDArray[np.float64]]:
+def _rig_poses(folder: Path, suffix: str) -> dict[tuple[int, int], Float]:
     """Return camera_from_world by image and camera, as frames and rigs say; no poses without their files.
 
     camera_from_world = sensor_from_rig · rig_from_world. Poses that are unknown or not finite are missing.
@@ -463,7 +462,7 @@ def _rig_poses(folder: Path, suffix: str) -> dict[tuple[int, int], NDArray[np.fl
         return {}
     with parsing(rigs):
         sensors = _sensors(open_table(rigs, "rig"))
-    found: dict[tuple[int, int], NDArray[np.float64]] = {}
+    found: dict[tuple[int, int], Float] = {}
     with parsing(frames):
         table = open_table(frames, "frame")
         for _ in table:
@@ -476,14 +475,14 @@ def _rig_poses(folder: Path, suffix: str) -> dict[tuple[int, int], NDArray[np.fl
     return found
 
 
-def _sensors(table: Table) -> dict[tuple[int, int], NDArray[np.float64] | None]:
+def _sensors(table: Table) -> dict[tuple[int, int], Float | None]:
     """Return camera_from_rig by rig and camera; the first sensor of a rig is its origin."""
-    sensors: dict[tuple[int, int], NDArray[np.float64] | None] = {}
+    sensors: dict[tuple[int, int], Float | None] = {}
     for _ in table:
         rig, count = table.take(_RIG)
         for number in range(count):
             kind, sensor = table.take(_SENSOR)
-            pose: NDArray[np.float64] | None = np.eye(4)
+            pose: Float | None = np.eye(4)
             if number:
                 pose = _known(table.take(_IN_RIG)) if table.take(_HAS_POSE)[0] else None
             if kind in _CAMERA_SENSOR:
@@ -491,7 +490,7 @@ def _sensors(table: Table) -> dict[tuple[int, int], NDArray[np.float64] | None]:
     return sensors
 
 
-def _known(numbers: Sequence[float]) -> NDArray[np.float64] | None:
+def _known(numbers: Sequence[float]) -> Float | None:
     """Return the rigid transform of seven numbers, or None if it is not one."""
     if not all(map(math.isfinite, numbers)) or not any(numbers[:4]):
         return None

@@ -26,6 +26,7 @@ from g2ard.io.packing import (
 )
 from g2ard.io.sanitize import Raw, logits_of
 from g2ard.io.stream import RawStream
+from g2ard.io.types import Float, Float32, Values
 from g2ard.progress import plural
 from g2ard.scene.splats import SH_C0, Splats
 from g2ard.scene.transform import as_stored
@@ -79,7 +80,7 @@ class Stream(RawStream):
         for (first, vertex), (_, sh) in zip(vertices, bands, strict=False):
             yield self._decode(first, vertex, sh)
 
-    def _decode(self, first: int, vertex: NDArray[Any], sh: NDArray[Any] | None) -> Raw:
+    def _decode(self, first: int, vertex: Values, sh: Values | None) -> Raw:
         raw, chunk, rest = Raw.empty(len(vertex), self._rest), self._chunk, self._rest
         of = np.arange(first, first + len(vertex)) // _CHUNK_ROWS
         position, rotation, scale, color = (vertex[name] for name in _PACKED)
@@ -99,9 +100,7 @@ class Stream(RawStream):
         return raw
 
 
-def _between(
-    chunk: NDArray[Any], of: NDArray[Any], pattern: str, axes: str, t: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _between(chunk: Values, of: Values, pattern: str, axes: str, t: Float) -> Float:
     """Interpolate by `t` between the bounds of each Gaussian's chunk."""
     low, high = (
         np.stack([chunk[pattern.format(end, axis)][of].astype(np.float64) for axis in axes], axis=1)
@@ -110,7 +109,7 @@ def _between(
     return low * (1 - t) + high * t
 
 
-def _coefficient(codes: NDArray[Any]) -> NDArray[np.float64]:
+def _coefficient(codes: Values) -> Float:
     """Decode bytes to [−4, 4]: bucket centres, except that the first and last bucket are the ends."""
     t = (codes.astype(np.float64) + 0.5) / 256
     return (np.select([codes == 0, codes == 255], [0.0, 1.0], t) - 0.5) * 8
@@ -129,7 +128,7 @@ def write(path: Path, splats: Splats, *, overwrite: bool = False) -> float:
     given = given.take(packing_order(given.means, _CHUNK_ROWS))
     error = rounding(given, given.narrowed())
     splats = as_stored(given)
-    bounds: dict[str, NDArray[np.float32]] = {}
+    bounds: dict[str, Float32] = {}
     words = np.empty(len(splats), [(name, "<u4") for name in _PACKED])
     words["packed_position"] = _packed(_within(bounds, "", "xyz", splats.means), _VECTOR_BITS)
     largest, others = smallest_three(unit_quats(splats.quats))
@@ -152,9 +151,7 @@ def write(path: Path, splats: Splats, *, overwrite: bool = False) -> float:
     return error + rounding(splats, _between(chunk, of, "{}_{}", "xyz", shares) + splats.offset)
 
 
-def _within(
-    bounds: dict[str, NDArray[np.float32]], what: str, axes: str, values: NDArray[Any]
-) -> NDArray[np.float64]:
+def _within(bounds: dict[str, Float32], what: str, axes: str, values: Values) -> Float:
     """Scale values to [0, 1] within their chunk, and add the chunk's bounds to `bounds`."""
     starts = np.arange(0, len(values), _CHUNK_ROWS)
     low = np.minimum.reduceat(values, starts).astype(np.float32)
@@ -167,7 +164,7 @@ def _within(
     return (values - low.astype(np.float64)[of]) / np.where(wide > 0, wide, 1.0)
 
 
-def _packed(values: NDArray[np.float64], bits: tuple[int, ...]) -> NDArray[np.uint32]:
+def _packed(values: Float, bits: tuple[int, ...]) -> NDArray[np.uint32]:
     """Pack (N, C) in [0, 1] into words, the first column in the highest bits."""
     word = np.zeros(len(values), np.uint32)
     for k, width in enumerate(bits):
@@ -175,7 +172,7 @@ def _packed(values: NDArray[np.float64], bits: tuple[int, ...]) -> NDArray[np.ui
     return word
 
 
-def _unpacked(words: NDArray[Any], bits: tuple[int, ...]) -> NDArray[np.float64]:
+def _unpacked(words: Values, bits: tuple[int, ...]) -> Float:
     """Return the (N, C) values in [0, 1] that `_packed` takes."""
     values, shift = np.empty((len(words), len(bits))), 0
     for k, width in reversed(list(enumerate(bits))):
@@ -185,7 +182,7 @@ def _unpacked(words: NDArray[Any], bits: tuple[int, ...]) -> NDArray[np.float64]
     return values
 
 
-def _harmonics(splats: Splats) -> NDArray[Any]:
+def _harmonics(splats: Splats) -> Values:
     """Quantise coefficients in [−4, 4] to bytes, channel-major."""
     rest = splats.shN.shape[1]
     rows = np.empty(len(splats), [(f"f_rest_{k}", "u1") for k in range(3 * rest)])

@@ -7,14 +7,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from g2ard.io import Source, read_view_set
 from g2ard.io.detect import run_scene
 from g2ard.io.images import colour_text, photo_traits
 from g2ard.io.sog import chunks_of
 from g2ard.io.splits import splits_of
-from g2ard.io.types import Note, Points, ViewFiles, ViewSet
+from g2ard.io.types import Note, Points, Values, ViewFiles, ViewSet
 from g2ard.progress import plural
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.shape import elongation
@@ -70,12 +69,12 @@ def bytes_of(path: Path) -> int:
     return sum(file.stat().st_size for file in files if file.is_file())
 
 
-def _quantiles(values: NDArray[Any]) -> dict[str, float]:
+def _quantiles(values: Values) -> dict[str, float]:
     values_at = np.percentile(values.astype(np.float64), _QUANTILES)
     return {str(q): float(v) for q, v in zip(_QUANTILES, values_at, strict=True)}
 
 
-def _extent(positions: NDArray[Any]) -> dict[str, list[float]]:
+def _extent(positions: Values) -> dict[str, list[float]]:
     low, high = np.percentile(positions, (1, 99), axis=0)
     return {
         "min": positions.min(0).tolist(),

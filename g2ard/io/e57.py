@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from g2ard.errors import G2ardError, InputError, missing
 from g2ard.io import judge
@@ -19,7 +18,7 @@ from g2ard.io.paths import check_unpacked, file_identity, user_cache
 from g2ard.io.photos import Frame, Lens, Listed, inverse, posed
 from g2ard.io.stream import JoinedClouds, MarkedPoints, Names, PointStream, telling
 from g2ard.io.transforms import FLIP
-from g2ard.io.types import Note, ViewFiles
+from g2ard.io.types import Float, Note, ViewFiles
 from g2ard.progress import plural
 from g2ard.scene.lenses import PhotoLens
 from g2ard.scene.transform import rotation_matrices
@@ -142,7 +141,7 @@ class _Scan(PointStream):
             text = f"scan {self._number} has {at:,} of {self.count:,} points"
             raise InputError(text, path=self.path)
 
-    def _points(self, fields: dict[str, NDArray[np.float64]]) -> MarkedPoints:
+    def _points(self, fields: dict[str, Float]) -> MarkedPoints:
         a, b, c = (fields[name] for name in self._place)
         if self._place == _SPHERICAL:  # range, azimuth, elevation
             a, b, c = a * np.cos(c) * np.cos(b), a * np.cos(c) * np.sin(b), a * np.sin(c)
@@ -258,7 +257,7 @@ def _frame(path: Path, number: int, node: Any, folder: Path) -> Frame | str:
     return Frame(photo.name, inverse(world_from_camera), lens, photo, mask=mask, listed=photo.name)
 
 
-def _pose(node: Any) -> NDArray[np.float64]:
+def _pose(node: Any) -> Float:
     """Return world_from_photo; parts that are missing are those of the identity."""
     quat, shift = [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0]
     if node.isDefined("rotation"):

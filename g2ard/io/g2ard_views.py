@@ -9,14 +9,14 @@ from typing import Any
 
 import msgspec
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from g2ard.errors import InputError
 from g2ard.io.finding import Finder
 from g2ard.io.jsonfile import Matrix, Number, Place, Pose, Weight, Whole, checked, read_own
 from g2ard.io.paths import beside
 from g2ard.io.photos import Frame, Lens, Listed, rigid
-from g2ard.io.types import ViewFiles
+from g2ard.io.types import Float, ViewFiles
 from g2ard.progress import plural
 from g2ard.scene.cameras import USUAL, Cameras
 from g2ard.scene.lenses import PARAMETERS, PhotoLens
@@ -88,7 +88,7 @@ def _photo_lens(lens: _PhotoLens | None, place: Place) -> PhotoLens | None:
     return PhotoLens(lens.model, (lens.size[0], lens.size[1]), tuple(lens.params), turn)
 
 
-def _exact(stored: NDArray[np.float64], place: Place) -> NDArray[np.float64]:
+def _exact(stored: Float, place: Place) -> Float:
     """Return the pose as stored if it is rigid to rounding, so that writing and reading change no bit."""
     nearest = rigid(stored, place)
     return stored if len(stored) == 4 and np.allclose(nearest, stored, rtol=0, atol=1e-9) else nearest

@@ -18,7 +18,6 @@ from urllib.parse import unquote
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from g2ard.config.choices import AXES, Axes
 from g2ard.errors import InputError, damaged, require
@@ -29,7 +28,7 @@ from g2ard.io.packing import packing_order, rounding, unit_quats, writable
 from g2ard.io.paths import check_regular, decoded
 from g2ard.io.sanitize import Raw, cleaned
 from g2ard.io.signs import MESH, SCAN
-from g2ard.io.types import Note, Noted
+from g2ard.io.types import Float, Float32, Note, Noted, Values
 from g2ard.progress import plural
 from g2ard.scene.splats import SH_C0, Splats
 from g2ard.scene.transform import (
@@ -111,9 +110,7 @@ def _plain(path: Path, splats: Splats) -> list[bytes]:
     return _glb(path, document, blobs)
 
 
-def spz_glb(
-    path: Path, splats: Splats, centre: NDArray[np.float64] | None = None
-) -> tuple[list[bytes], float]:
+def spz_glb(path: Path, splats: Splats, centre: Float | None = None) -> tuple[list[bytes], float]:
     """Return the parts of a .glb that holds an SPZ, and the largest change of a position by rounding.
 
     The node's translation is the scene's `offset`, and `centre`, which makes coordinates small.
@@ -171,13 +168,13 @@ def _glb(path: Path, document: dict[str, Any], blobs: list[bytes]) -> list[bytes
     return [head, text, struct.pack("<II", start, _BIN), *blobs]
 
 
-def _attributes(splats: Splats) -> dict[str, NDArray[Any]]:
+def _attributes(splats: Splats) -> dict[str, Values]:
     linear = np.clip(splats.colors.astype(np.float64), 0, 1)
     linear = np.where(linear <= 0.04045, linear / 12.92, ((linear + 0.055) / 1.055) ** 2.4)
     alphas = splats.opacities[:, None]
     quats = unit_quats(splats.quats)
     turned = quats[:, [1, 2, 3, 0]] * (*_GLTF_TURN, 1)
-    out: dict[str, NDArray[Any]] = {
+    out: dict[str, Values] = {
         "POSITION": (splats.means * _GLTF_TURN).astype("<f4"),
         "COLOR_0": np.rint(np.column_stack([linear, alphas]) * 65535).astype("<u2"),
         f"{EXTENSION}:ROTATION": turned.astype("<f4"),
@@ -362,7 +359,7 @@ def _has_splats(primitive: _Primitive) -> bool:
     return bool({EXTENSION, _SPZ_ALONE} & set(primitive.extensions))
 
 
-def _shown(path: Path, document: _Document, binary: bytes) -> Iterator[tuple[Noted, NDArray[np.float64]]]:
+def _shown(path: Path, document: _Document, binary: bytes) -> Iterator[tuple[Noted, Float]]:
     """Yield each splat primitive with each of its placements."""
     shown = _nodes_shown(path, document)
     for index, mesh in enumerate(document.meshes):
@@ -374,7 +371,7 @@ def _shown(path: Path, document: _Document, binary: bytes) -> Iterator[tuple[Not
             yield from ((scene, placement) for placement in placements)
 
 
-def placed(path: Path, parts: Iterable[tuple[Noted, NDArray[np.float64]]]) -> Noted | None:
+def placed(path: Path, parts: Iterable[tuple[Noted, Float]]) -> Noted | None:
     """Join parts by their (4, 4) placements, in the axes of a .ply; return None without parts."""
     moved, notes, uneven = list[Splats](), list[Note](), 0
     for (part, own), placement in parts:
@@ -421,7 +418,7 @@ def _primitive(within: Place, document: _Document, binary: bytes, primitive: _Pr
 def _attributes_of(place: Place, document: _Document, binary: bytes, names: dict[str, Any]) -> Noted:
     """Read the float or integer attributes of a primitive, in the axes of a .ply."""
 
-    def values(name: str, width: int) -> NDArray[np.float32]:
+    def values(name: str, width: int) -> Float32:
         if name not in names:
             raise InputError(f"attribute {name!r} is missing", path=place.path)
         return _accessor(
@@ -468,9 +465,7 @@ def _view(document: _Document, index: int | None, place: Place, what: str) -> _V
     return view
 
 
-def _accessor(
-    place: Place, document: _Document, binary: bytes, index: int, name: str, width: int
-) -> NDArray[np.float32]:
+def _accessor(place: Place, document: _Document, binary: bytes, index: int, name: str, width: int) -> Float32:
     """Return the (count, width) values of an accessor; normalised integers become fractions."""
     path = place.path
     accessor = _entry(document.accessors, index, place)
@@ -509,7 +504,7 @@ def _nodes_shown(path: Path, document: _Document) -> set[int]:
     return found if any(document.nodes[at].mesh in splats for at in found) else every
 
 
-def _placements(path: Path, nodes: list[_Node], mesh: int, seen: set[int]) -> list[NDArray[np.float64]]:
+def _placements(path: Path, nodes: list[_Node], mesh: int, seen: set[int]) -> list[Float]:
     """Return the (4, 4) placements by a mesh's `seen` nodes and their ancestors, in the axes of a .ply."""
     parents: dict[int, int] = {}
     for i, node in enumerate(nodes):
@@ -535,7 +530,7 @@ def _placements(path: Path, nodes: list[_Node], mesh: int, seen: set[int]) -> li
     return found if holders else [np.eye(4)]
 
 
-def _local(node: _Node) -> NDArray[np.float64]:
+def _local(node: _Node) -> Float:
     if node.matrix is not None:
         return np.array(node.matrix).reshape(4, 4).T
     matrix = np.eye(4)

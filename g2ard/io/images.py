@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from PIL import Image, ImageCms, ImageOps
 
 from g2ard.config.choices import BLACK, Colour
@@ -26,6 +26,7 @@ from g2ard.io.atomic import atomic_output
 from g2ard.io.finding import MOVING, files_in
 from g2ard.io.jsonfile import Place, Row, checked, read_json
 from g2ard.io.photos import fits, opened_image, photo_size, turns
+from g2ard.io.types import Bytes, Float, Float32, Mask, Values
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.lenses import PhotoLens
 from g2ard.scene.samples import evenly_spaced
@@ -37,7 +38,7 @@ _BORDER_COLOUR_SLACK, _BORDER_SHARE = 3 / 255, 0.8
 
 def load_photo(
     cameras: Cameras, index: int, background: Sequence[float] | None = BLACK
-) -> tuple[NDArray[np.float32], NDArray[np.bool_] | None]:
+) -> tuple[Float32, Mask | None]:
     """Read the photo of a view as an image of its pinhole camera, and its mask as `load_mask` does.
 
     A distorted photo is undistorted at its own resolution, then resized by area. Pixels outside of the mask,
@@ -53,14 +54,14 @@ def load_photo(
     return (image if background is None else composited(image, background)), mask
 
 
-def composited(image: NDArray[np.float32], background: Sequence[float]) -> NDArray[np.float32]:
+def composited(image: Float32, background: Sequence[float]) -> Float32:
     """Composite premultiplied RGBA over a background; RGB is unchanged."""
     if image.shape[2] == 4:
         image = image[..., :3] + (1 - image[..., 3:]) * np.asarray(background, np.float32)
     return np.ascontiguousarray(image)
 
 
-def _image(cameras: Cameras, index: int) -> NDArray[np.float32]:
+def _image(cameras: Cameras, index: int) -> Float32:
     path, name = cameras.image_paths[index], cameras.names[index]
     if path is None:
         raise InputError(f"({name}) has no photo", index=index, item="view", hint="pass views with photos")
@@ -138,13 +139,13 @@ def colour_text(colour: Colour) -> str:
     return named.get((red, green, blue), f"{red:g},{green:g},{blue:g}")
 
 
-def find_exposures(cameras: Cameras) -> dict[str, NDArray[np.float64]]:
+def find_exposures(cameras: Cameras) -> dict[str, Float]:
     """Return exposures by view name from 3DGS's exposure.json beside the photos' folder, if there is one.
 
     It holds a 3×4 matrix C per photo, named with or without the suffix: photo = C·(render, 1).
     """
-    exposures: dict[str, NDArray[np.float64]] = {}
-    tables: dict[Path, dict[str, NDArray[np.float64]]] = {}
+    exposures: dict[str, Float] = {}
+    tables: dict[Path, dict[str, Float]] = {}
     for name, photo in zip(cameras.names, cameras.image_paths, strict=True):
         if photo is None:
             continue
@@ -168,7 +169,7 @@ def exposure_file(photo: Path) -> Path:
     return photo.parent.parent / "exposure.json"
 
 
-def load_mask(cameras: Cameras, index: int) -> NDArray[np.bool_] | None:
+def load_mask(cameras: Cameras, index: int) -> Mask | None:
     """Read the (H, W) mask of a view's photo, in the pixels of `load_photo`; None if all count.
 
     Pixels count that the photo holds and whose mask is brighter than half of its brightest pixel; for a photo
@@ -178,7 +179,7 @@ def load_mask(cameras: Cameras, index: int) -> NDArray[np.bool_] | None:
     return _mask(cameras, index, None)
 
 
-def _mask(cameras: Cameras, index: int, image: NDArray[np.float32] | None) -> NDArray[np.bool_] | None:
+def _mask(cameras: Cameras, index: int, image: Float32 | None) -> Mask | None:
     """Return the mask of a photo. A photo that is its own mask is read, unless `image` holds it."""
     held, path = _held(cameras, index), cameras.mask_paths[index]
     if path is None:
@@ -197,17 +198,17 @@ def _mask(cameras: Cameras, index: int, image: NDArray[np.float32] | None) -> ND
 _LABELS = 32 / 255  # brightest value below which the values of a mask are labels
 
 
-def _kept(mask: NDArray[np.float32]) -> NDArray[np.bool_]:
+def _kept(mask: Float32) -> Mask:
     """Return the pixels that a mask keeps."""
     shade = composited(mask, BLACK).max(2)
     if mask.shape[2] == 4 and not shade.any():
         return mask[..., 3] > 0.5
     top = float(shade.max())
-    kept: NDArray[np.bool_] = shade > 0.5 * (top if top >= _LABELS else min(top, 1 / 255))
+    kept: Mask = shade > 0.5 * (top if top >= _LABELS else min(top, 1 / 255))
     return kept
 
 
-def _held(cameras: Cameras, index: int) -> NDArray[np.bool_] | None:
+def _held(cameras: Cameras, index: int) -> Mask | None:
     """Return the pixels of a view that its undistorted photo holds in full, or None if all are."""
     photo, distortion, lens = cameras.image_paths[index], cameras.distortions[index], cameras.lenses[index]
     if photo is None or (lens is None and not distortion.any()):
@@ -217,7 +218,7 @@ def _held(cameras: Cameras, index: int) -> NDArray[np.bool_] | None:
     if lens is not None:
         times = _samples(lens, width, cameras.Ks[index])
         samples = _lens_lookup(lens, tuple(cameras.Ks[index].ravel()), target, times)[1]
-        whole: NDArray[np.bool_] = np.all(samples.reshape(target[1], times, target[0], times), axis=(1, 3))
+        whole: Mask = np.all(samples.reshape(target[1], times, target[0], times), axis=(1, 3))
         return None if whole.all() else whole
     K = cameras.Ks[index] * np.array([[width / target[0]], [height / target[1]], [1.0]])
     held = _held_at(width, height, tuple(K.ravel()), tuple(distortion), target)
@@ -227,7 +228,7 @@ def _held(cameras: Cameras, index: int) -> NDArray[np.bool_] | None:
 @lru_cache(maxsize=2)
 def _held_at(
     width: int, height: int, K: tuple[float, ...], distortion: tuple[float, ...], target: tuple[int, int]
-) -> NDArray[np.bool_]:
+) -> Mask:
     held = _lookup(width, height, K, distortion)[-1].reshape(height, width, 1)
     found = resized(held.astype(np.float32), target)[..., 0] > _WHOLE
     found.flags.writeable = False
@@ -237,7 +238,7 @@ def _held_at(
 _WHOLE = 0.999  # share of a pixel above which it counts as whole
 
 
-def _open(path: Path, like: tuple[int, int] | None = None) -> NDArray[np.float32]:
+def _open(path: Path, like: tuple[int, int] | None = None) -> Float32:
     """Decode a photo as (H, W, 3) sRGB, or as premultiplied (H, W, 4) RGBA; for `like` see `turns`."""
     with opened_image(path) as stored:
         wide, upright = _is_deep(stored), turns(stored, like)
@@ -269,7 +270,7 @@ def _raw_mode(image: Any) -> str:
     return found[0] if found else ""
 
 
-def _words(path: Path, image: Any, upright: bool) -> NDArray[Any]:
+def _words(path: Path, image: Any, upright: bool) -> Values:
     """Return the (H, W, C) values of 16 bits. Of colours, Pillow decodes the upper bytes; told that they are
     of the other byte order, it decodes the lower ones."""
     if image.mode.startswith("I"):
@@ -329,9 +330,7 @@ def _conversion(profile: bytes | None, mode: str) -> ImageCms.ImageCmsTransform 
     return None
 
 
-def _undistorted(
-    image: NDArray[np.float32], K: NDArray[np.float64], distortion: NDArray[np.float64]
-) -> NDArray[np.float32]:
+def _undistorted(image: Float32, K: Float, distortion: Float) -> Float32:
     """Sample the distorted photo for each pixel of the pinhole image, bilinearly."""
     height, width = image.shape[:2]
     rows, columns, down, right, _ = _lookup(width, height, tuple(K.ravel()), tuple(distortion))
@@ -384,13 +383,11 @@ def _modified(path: Path) -> int | None:
 
 
 @lru_cache(maxsize=1)  # several views of a photo follow each other
-def _opened(path: Path, modified: int | None, like: tuple[int, int]) -> NDArray[np.float32]:
+def _opened(path: Path, modified: int | None, like: tuple[int, int]) -> Float32:
     return _open(path, like)
 
 
-def _through(
-    image: NDArray[np.float32], lens: PhotoLens, K: NDArray[np.float64], size: tuple[int, int]
-) -> NDArray[np.float32]:
+def _through(image: Float32, lens: PhotoLens, K: Float, size: tuple[int, int]) -> Float32:
     """Sample a photo through its lens for each pixel of a pinhole view: bilinearly at as many points a pixel
     as the photo is finer, which are averaged."""
     height, width = image.shape[:2]
@@ -413,7 +410,7 @@ def _through(
 _MOST_SAMPLES = 8
 
 
-def _samples(lens: PhotoLens, width: int, K: NDArray[np.float64]) -> int:
+def _samples(lens: PhotoLens, width: int, K: Float) -> int:
     """Return the number of samples along each side of a pixel: the pixels of a photo of this width there."""
     finer = width / lens.size[0] * max(lens.focal) / min(K[0, 0], K[1, 1])
     return int(np.clip(np.ceil(finer - 0.01), 1, _MOST_SAMPLES))
@@ -422,7 +419,7 @@ def _samples(lens: PhotoLens, width: int, K: NDArray[np.float64]) -> int:
 @lru_cache(maxsize=6)  # the faces of a cube
 def _lens_lookup(
     lens: PhotoLens, K: tuple[float, ...], size: tuple[int, int], times: int
-) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+) -> tuple[Float, Mask]:
     """Return the pixel of a lens for each sample of a pinhole view, and whether its photo holds it."""
     v, u = (np.mgrid[0 : size[1] * times, 0 : size[0] * times] + 0.5) / times
     rays = np.stack([u.ravel(), v.ravel(), np.ones(u.size)], 1) @ np.linalg.inv(np.array(K).reshape(3, 3)).T
@@ -435,7 +432,7 @@ def _fold(k1: float, k2: float, k3: float) -> float:
     return min((root.real for root in roots if abs(root.imag) < 1e-9 and root.real > 0), default=np.inf)
 
 
-def resized(image: NDArray[np.float32], size: tuple[int, int]) -> NDArray[np.float32]:
+def resized(image: Float32, size: tuple[int, int]) -> Float32:
     """Resize an (H, W, C) float32 image to (width, height): by area when shrinking, bilinearly when growing.
 
     >>> resized(np.full((4, 8, 3), 0.5, np.float32), (2, 1)).tolist()
@@ -452,7 +449,7 @@ def resized(image: NDArray[np.float32], size: tuple[int, int]) -> NDArray[np.flo
     return np.ascontiguousarray(image)
 
 
-def _averaged(image: NDArray[np.float32], length: int, axis: int) -> NDArray[np.float32]:
+def _averaged(image: Float32, length: int, axis: int) -> Float32:
     """Return exact means over `length` equal parts of an axis, from differences of its running sum."""
     count = image.shape[axis]
     pad = [(1, 0) if i == axis else (0, 0) for i in range(3)]
@@ -464,7 +461,7 @@ def _averaged(image: NDArray[np.float32], length: int, axis: int) -> NDArray[np.
     return (np.diff(low + share * (high - low), axis=axis) * (length / count)).astype(np.float32)
 
 
-def to_bytes(image: ArrayLike) -> NDArray[np.uint8]:
+def to_bytes(image: ArrayLike) -> Bytes:
     """Convert values in [0, 1] to bytes, clipped and rounded to nearest; bytes are unchanged, NaN is black.
 
     >>> to_bytes([[-1.0, 0.5, 2.0]]).tolist()
@@ -476,7 +473,7 @@ def to_bytes(image: ArrayLike) -> NDArray[np.uint8]:
     return np.rint(np.clip(np.nan_to_num(values, nan=0.0), 0, 1) * 255).astype(np.uint8)
 
 
-def as_saved(image: ArrayLike) -> NDArray[np.float32]:
+def as_saved(image: ArrayLike) -> Float32:
     """Round an image in [0, 1] like an 8-bit PNG: clipped, in multiples of 1/255.
 
     >>> (255 * as_saved([[-1.0, 0.5, 2.0]])).tolist()
@@ -515,7 +512,7 @@ def check_animation(path: Path) -> None:
 
 
 def write_animation(
-    path: Path, pictures: Iterable[NDArray[np.uint8]], *, fps: float = 25, overwrite: bool = False
+    path: Path, pictures: Iterable[Bytes], *, fps: float = 25, overwrite: bool = False
 ) -> None:
     """Write images of one size as an endless animation in the format of the suffix.
 
@@ -532,7 +529,7 @@ def write_animation(
         first.save(temporary, save_all=True, append_images=rest, **options)
 
 
-def _one_size(path: Path, frames: Iterator[NDArray[np.uint8]]) -> Iterator[NDArray[np.uint8]]:
+def _one_size(path: Path, frames: Iterator[Bytes]) -> Iterator[Bytes]:
     first = next(frames)
     for frame in itertools.chain([first], frames):
         if frame.shape != first.shape:
@@ -541,7 +538,7 @@ def _one_size(path: Path, frames: Iterator[NDArray[np.uint8]]) -> Iterator[NDArr
         yield np.ascontiguousarray(frame)
 
 
-def _encode(path: Path, frames: Iterator[NDArray[np.uint8]], fps: float) -> None:
+def _encode(path: Path, frames: Iterator[Bytes], fps: float) -> None:
     """Pipe raw frames to ffmpeg; H.264 with 4:2:0 needs even sides, so odd ones lose a pixel."""
     first = next(frames)
     height, width = first.shape[:2]

@@ -5,10 +5,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from g2ard.io.sanitize import Raw, logits_of
-from g2ard.io.types import Note
+from g2ard.io.types import Float, Note, Values
 from g2ard.progress import plural
 from g2ard.scene.splats import SH_C0
 
@@ -23,8 +22,6 @@ _OUTSIDE, _ROUNDING = 0.1, 1e-3
 """Amounts by which opacities leave [0, 1] that tell logits, and that are clamped without a note."""
 
 _LARGEST_LOGIT = 20.0  # whole numbers up to here may be logits
-
-Values = NDArray[Any]
 
 
 def full_scales(kind: np.dtype[Any]) -> tuple[float, ...]:
@@ -77,7 +74,7 @@ def coarse(positions: Values, apart: float) -> tuple[Note, ...]:
     return (Note("coarse_positions", len(positions), text),) if step > _FINE * apart > 0 else ()
 
 
-def unpacked(packed: Values) -> list[NDArray[np.float64]]:
+def unpacked(packed: Values) -> list[Float]:
     """Return red, green and blue of PCL's colours, 0xRRGGBB in 32-bit integers or in floats of these bits."""
     bits = np.ascontiguousarray(packed).view("<u4")
     return [(bits >> shift & 255).astype(np.float64) for shift in (16, 8, 0)]

@@ -4,11 +4,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from g2ard.errors import InputError, damaged
 from g2ard.io.sanitize import Raw, cleaned
-from g2ard.io.types import Noted
+from g2ard.io.types import Float, Noted, Values
 from g2ard.scene.splats import SH_C0
 
 _HEADER = 4096  # bytes of the file's header
@@ -102,9 +101,7 @@ def _rows(
     return raw, end
 
 
-def _centres(
-    path: Path, data: bytes, i: int, at: int, section: dict[str, Any], steps: NDArray[Any]
-) -> NDArray[np.float64]:
+def _centres(path: Path, data: bytes, i: int, at: int, section: dict[str, Any], steps: Values) -> Float:
     """Return positions from 16-bit steps: full buckets first, then partial ones of the listed lengths."""
     full, partial, buckets, size = (section[k] for k in ("full", "partial", "buckets", "bucket_bytes"))
     if size < 12 or full + partial != buckets:

@@ -7,14 +7,13 @@ from pathlib import Path
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from g2ard.errors import InputError
 from g2ard.io import colmap, transforms
 from g2ard.io.jsonfile import Place, Pose, Positive, checked, read_json
 from g2ard.io.photos import Frame, Listed, inverse, rigid
 from g2ard.io.trainer_yaml import Settings, below, read_settings
-from g2ard.io.types import Note, ViewFiles
+from g2ard.io.types import Float, Note, ViewFiles
 from g2ard.scene.samples import evenly_spaced
 
 NAME = "dataparser_transforms.json"
@@ -63,7 +62,7 @@ def read(views: ViewFiles) -> Listed:
     return found._replace(notes=(Note("optimised_poses", len(frames), text),))
 
 
-def _data(views: ViewFiles, settings: Settings | None) -> tuple[Sequence[Frame], NDArray[np.float64], float]:
+def _data(views: ViewFiles, settings: Settings | None) -> tuple[Sequence[Frame], Float, float]:
     """Return the data's frames, and A and the scale that were applied to them."""
     folder = views.path
     if settings is None:
@@ -99,7 +98,7 @@ def _parser(path: Path, settings: Settings) -> tuple[str, Settings, Path]:
     return name, parser[1], data
 
 
-def _saved(views: ViewFiles, options: Settings | None) -> tuple[Sequence[Frame], NDArray[np.float64], float]:
+def _saved(views: ViewFiles, options: Settings | None) -> tuple[Sequence[Frame], Float, float]:
     """Return the frames, A and scale of a transforms.json, or of a folder with transforms*.json."""
     data = views.path
     file = data / "transforms.json" if (data / "transforms.json").is_file() else data
@@ -150,14 +149,14 @@ def _optimized(settings: Settings | None) -> str | None:
     return None if mode in (None, "off", "false") else mode
 
 
-def _moved(frame: Frame, transform: NDArray[np.float64], scale: float) -> Frame:
+def _moved(frame: Frame, transform: Float, scale: float) -> Frame:
     """Move a frame by x → scale·(transform·x); the scale only applies to its centre."""
     world_from_camera = transform @ inverse(frame.viewmat)
     world_from_camera[:3, 3] *= scale
     return frame._replace(viewmat=inverse(world_from_camera))
 
 
-def _affine(rows: Pose, place: Place) -> NDArray[np.float64]:
+def _affine(rows: Pose, place: Place) -> Float:
     """Return a 3×4 or 4×4 list as a (4, 4) rotation and translation."""
     out = np.eye(4)
     out[:3] = rows[:3]

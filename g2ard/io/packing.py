@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from g2ard.errors import InputError
 from g2ard.io.sanitize import LOG_SCALE_LIMIT
+from g2ard.io.types import Bytes, Float, Values
 from g2ard.scene.splats import Splats
 from g2ard.scene.transform import as_stored, moved_axes
 
@@ -39,7 +40,7 @@ def own_place(stored: Splats) -> dict[str, Any]:
     return own if stored.axes == "RDF" else {**own, "axes": stored.axes}
 
 
-def rounding(splats: Splats, stored: Splats | NDArray[np.float64]) -> float:
+def rounding(splats: Splats, stored: Splats | Float) -> float:
     """Return the largest difference of a coordinate from its stored value, in scene units.
 
     `stored` is the scene as stored, or its (N, 3) world coordinates; rows in the same order.
@@ -63,7 +64,7 @@ def as_packed(path: Path, splats: Splats) -> Splats:
     return form.recentred(form.offset + middle) if np.abs(middle).max() > FAR_FROM_ORIGIN else form
 
 
-def packing_order(means: NDArray[Any], chunk: int = 1) -> NDArray[np.intp]:
+def packing_order(means: Values, chunk: int = 1) -> NDArray[np.intp]:
     """Return rows by shells of distance from the median, and in Morton order within a shell.
 
     Rows up to four times the 75th percentile of the distances are one shell, and each doubling beyond is
@@ -85,7 +86,7 @@ def packing_order(means: NDArray[Any], chunk: int = 1) -> NDArray[np.intp]:
     return np.concatenate([rows[morton_order(means[rows])] for rows in groups])
 
 
-def morton_order(means: NDArray[Any]) -> NDArray[np.intp]:
+def morton_order(means: Values) -> NDArray[np.intp]:
     """Return rows in Morton order (2²¹ cells per axis, ties by row)."""
     low, high = means.min(axis=0).astype(np.float64), means.max(axis=0).astype(np.float64)
     size = max(float((high - low).max()), np.finfo(float).tiny)
@@ -108,14 +109,14 @@ def _spread(v: NDArray[np.uint64]) -> NDArray[np.uint64]:
     return v
 
 
-def log_scales(splats: Splats) -> NDArray[np.float64]:
+def log_scales(splats: Splats) -> Float:
     """Return the (N, 3) natural logarithms of scales, clamped to the limits of readers."""
     with np.errstate(divide="ignore"):
         logs = np.log(splats.scales.astype(np.float64))
     return np.clip(logs, -LOG_SCALE_LIMIT, LOG_SCALE_LIMIT)
 
 
-def unit_quats(quats: NDArray[Any]) -> NDArray[np.float64]:
+def unit_quats(quats: Values) -> Float:
     """Normalise (N, 4) quaternions; zeros become the identity."""
     q = quats.astype(np.float64)
     q /= np.maximum(np.abs(q).max(axis=1, keepdims=True), np.finfo(float).tiny)
@@ -123,7 +124,7 @@ def unit_quats(quats: NDArray[Any]) -> NDArray[np.float64]:
     return np.where(norms > 0, q / np.maximum(norms, 0.5), [1.0, 0, 0, 0])
 
 
-def smallest_three(quats: NDArray[np.float64]) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
+def smallest_three(quats: Float) -> tuple[NDArray[np.intp], Float]:
     """Return the index of each unit quaternion's largest component, and the other three.
 
     The sign is chosen so that the largest is positive; the others are within ±1/√2.
@@ -138,7 +139,7 @@ def smallest_three(quats: NDArray[np.float64]) -> tuple[NDArray[np.intp], NDArra
     return largest, signed[rows[:, None], _OTHER_COMPONENTS[largest]] + 0.0
 
 
-def from_smallest_three(largest: NDArray[Any], others: NDArray[np.float64]) -> NDArray[np.float64]:
+def from_smallest_three(largest: Values, others: Float) -> Float:
     """Return the (N, 4) unit quaternions that `smallest_three` takes apart."""
     quats, rows = np.empty((len(others), 4)), np.arange(len(others))
     quats[rows[:, None], _OTHER_COMPONENTS[largest]] = others
@@ -146,11 +147,11 @@ def from_smallest_three(largest: NDArray[Any], others: NDArray[np.float64]) -> N
     return quats
 
 
-def as_bytes(values: NDArray[Any]) -> NDArray[np.uint8]:
+def as_bytes(values: Values) -> Bytes:
     """Round values to bytes, clipped to 0 … 255."""
     return np.clip(np.rint(values), 0, 255).astype(np.uint8)
 
 
-def coded(values: NDArray[Any], top: int) -> NDArray[np.int64]:
+def coded(values: Values, top: int) -> NDArray[np.int64]:
     """Round values in [0, 1] to integers in 0 … top."""
     return np.clip(np.rint(values * top), 0, top).astype(np.int64)

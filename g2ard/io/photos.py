@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import IO, TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from g2ard.errors import InputError, damaged
 from g2ard.io.finding import (
@@ -28,7 +28,7 @@ from g2ard.io.finding import (
 from g2ard.io.jsonfile import Place
 from g2ard.io.paths import check_regular
 from g2ard.io.signs import PHOTOS, foreign
-from g2ard.io.types import Note, ViewSet
+from g2ard.io.types import Float, Note, ViewSet
 from g2ard.progress import plural
 from g2ard.scene.cameras import LARGEST_IMAGE, USUAL, Cameras, check_image
 from g2ard.scene.lenses import PhotoLens
@@ -53,7 +53,7 @@ class Lens(NamedTuple):
     pinhole views are to be made from, or that this is such a view of (`made`)."""
 
     size: tuple[int, int]
-    K: NDArray[np.float64]
+    K: Float
     distortion: tuple[float, ...] = (0.0,) * 5
     photo: PhotoLens | None = None
     made: bool = False
@@ -89,7 +89,7 @@ class Frame(NamedTuple):
     """A view as listed in a file; its `photo` may be missing, and `listed` is what the file calls it."""
 
     name: str
-    viewmat: NDArray[np.float64]
+    viewmat: Float
     lens: Lens
     photo: Path | None
     split: str | None = None
@@ -230,7 +230,7 @@ def exif_focal(path: Path) -> float | None:
     return None
 
 
-def rigid(matrix: NDArray[np.float64], place: Place) -> NDArray[np.float64]:
+def rigid(matrix: Float, place: Place) -> Float:
     """Return the rigid transform nearest to a (4, 4) or (3, 4) pose with rounding errors or a uniform scale.
 
     Raise an `InputError` for a pose that is not finite, is mirrored, or differs from a rotation by over 1 %.
@@ -246,14 +246,14 @@ def rigid(matrix: NDArray[np.float64], place: Place) -> NDArray[np.float64]:
     return out
 
 
-def posed(quat: ArrayLike, translation: ArrayLike) -> NDArray[np.float64]:
+def posed(quat: ArrayLike, translation: ArrayLike) -> Float:
     """Return the (4, 4) rigid transform of a quaternion wxyz, of any length, and a translation."""
     out = np.eye(4)
     out[:3, :3], out[:3, 3] = rotation_matrices(np.array([quat]))[0], translation
     return out
 
 
-def inverse(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
+def inverse(matrix: Float) -> Float:
     R, t = matrix[:3, :3], matrix[:3, 3]
     out = np.eye(4)
     out[:3, :3], out[:3, 3] = R.T, -R.T @ t

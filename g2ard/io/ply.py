@@ -3,11 +3,9 @@
 import re
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.lib.recfunctions import structured_to_unstructured
-from numpy.typing import NDArray
 
 from g2ard.config.choices import PlyLayout, RenderModel
 from g2ard.errors import InputError, require
@@ -15,7 +13,7 @@ from g2ard.io import judge, plyfiles
 from g2ard.io.packing import rounding
 from g2ard.io.sanitize import BLOCK, LOG_SCALE_LIMIT, Raw
 from g2ard.io.stream import RawStream, SceneStream
-from g2ard.io.types import Note
+from g2ard.io.types import Float, Float32, Note, Values
 from g2ard.progress import plural
 from g2ard.scene.splats import SH_C0, Splats, far_middle, unit_quats
 from g2ard.scene.transform import as_stored, stand_as
@@ -92,7 +90,7 @@ class Stream(RawStream):
         self._read, self._white = self._judged()
         self.notes += self._read.notes
 
-    def positions(self, rows: int) -> Iterator[NDArray[np.float32]]:
+    def positions(self, rows: int) -> Iterator[Float32]:
         for _, block in plyfiles.row_blocks(self.path, self._rows, rows):
             with np.errstate(over="ignore", invalid="ignore"):
                 means = self._means(block)
@@ -107,10 +105,10 @@ class Stream(RawStream):
                     self._decode(block[part], raw.take(part))
             yield raw
 
-    def _columns(self, block: NDArray[Any], names: list[str]) -> NDArray[Any]:
+    def _columns(self, block: Values, names: list[str]) -> Values:
         return structured_to_unstructured(block[[self._names[name] for name in names]])
 
-    def _means(self, block: NDArray[Any]) -> NDArray[np.float32]:
+    def _means(self, block: Values) -> Float32:
         means = self._columns(block, _MEANS)
         return np.asarray(means - self._shift if self._shift.any() else means, np.float32)
 
@@ -127,7 +125,7 @@ class Stream(RawStream):
         full = judge.white(base, judge.full_scales(base.dtype))
         return judge.judged(scales, opacities, np.zeros((0, 3)), logs=True), full
 
-    def _decode(self, block: NDArray[Any], raw: Raw) -> None:
+    def _decode(self, block: Values, raw: Raw) -> None:
         raw.means[:] = self._means(block)
         if self._rgb is None:
             raw.sh0[:, 0] = self._read.sh0(self._columns(block, _DC))
@@ -149,7 +147,7 @@ class Stream(RawStream):
                 raw.shN[:, :, channel] = bands[:, channel, : self._kept]
 
 
-def _joined(groups: list[NDArray[Any]]) -> NDArray[Any]:
+def _joined(groups: list[Values]) -> Values:
     """Return groups of rows as one, with zeros for harmonics past their degrees; the last has the most."""
     if len(groups) == 1:
         return groups[0]
@@ -165,7 +163,7 @@ def _joined(groups: list[NDArray[Any]]) -> NDArray[Any]:
     return rows
 
 
-def _widen(raw: Raw, size: NDArray[np.float64]) -> None:
+def _widen(raw: Raw, size: Float) -> None:
     """Apply the 3D filter of Mip-Splatting of (n,) sizes f: σ² + f², and α·√(Πσ² / Π(σ² + f²))."""
     before = 2 * raw.log_scales.astype(np.float64)
     with np.errstate(divide="ignore"):
@@ -259,9 +257,7 @@ def _nothing_of(scene: SceneStream) -> Splats:
     return stand_as(empty, scene)
 
 
-def _blocks(
-    path: Path, parts: Iterable[Splats], names: list[str], normals: bool
-) -> Iterator[NDArray[np.float32]]:
+def _blocks(path: Path, parts: Iterable[Splats], names: list[str], normals: bool) -> Iterator[Float32]:
     first = 0
     for block in (part.take(slice(at, at + BLOCK)) for part in parts for at in range(0, len(part), BLOCK)):
         n = len(block)

@@ -6,16 +6,16 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from plyfile import PlyData, PlyElement, PlyElementParseError, PlyListProperty, PlyParseError
 
 from g2ard.config.choices import AXES, Axes, RenderModel
 from g2ard.errors import InputError, damaged
 from g2ard.io.atomic import atomic_output
 from g2ard.io.paths import plain_numbers
+from g2ard.io.types import Float, Values
 from g2ard.scene.splats import Splats
 from g2ard.scene.transform import moved_axes
 
@@ -130,7 +130,7 @@ def groups_of(header: PlyHeader) -> list[str]:
     return ["vertex"] if "vertex" in header.counts or not groups else groups
 
 
-def offset_of(path: Path, header: PlyHeader) -> NDArray[np.float64]:
+def offset_of(path: Path, header: PlyHeader) -> Float:
     """Return the (3,) offset of a comment `g2ard offset X Y Z`, turned to the file's axes; zeros without one.
 
     The comment is in the axes of a comment `g2ard axes`, so it holds coordinates of the map.
@@ -215,7 +215,7 @@ def comments_of(stored: Splats) -> list[str]:
     return comments + (["SplatRenderMode: mip"] if stored.render_model == "antialiased" else [])
 
 
-def read_element(path: Path, header: PlyHeader, *names: str, plain: bool = False) -> list[NDArray[Any]]:
+def read_element(path: Path, header: PlyHeader, *names: str, plain: bool = False) -> list[Values]:
     """Return an array of rows per element name, memory-mapped if the file is binary.
 
     Lists are first read as triangles, since lists of a known length can be mapped; if a polygon has another
@@ -266,7 +266,7 @@ def write_rows(
     path: Path,
     types: dict[str, str],
     count: int,
-    blocks: Iterable[NDArray[Any]],
+    blocks: Iterable[Values],
     overwrite: bool,
     comments: Sequence[str] = (),
 ) -> None:
@@ -284,9 +284,7 @@ def write_rows(
             raise InputError(f"not written: got {written:,} vertices, expected {count:,}", path=path)
 
 
-def row_blocks(
-    path: Path, every: NDArray[Any], rows: int, start: int = 0
-) -> Iterator[tuple[int, NDArray[Any]]]:
+def row_blocks(path: Path, every: Values, rows: int, start: int = 0) -> Iterator[tuple[int, Values]]:
     """Yield an element's rows from `start` in blocks of `rows`, each with the index of its first row.
 
     Mapped rows are read with file reads, since mapped pages count as memory of the process.
@@ -302,7 +300,7 @@ def row_blocks(
         yield first, block
 
 
-def spread_rows(rows: NDArray[Any], count: int = 100_000) -> NDArray[Any]:
+def spread_rows(rows: Values, count: int = 100_000) -> Values:
     """Return evenly spaced rows: `count` to twice as many, or all if there are fewer.
 
     A memory map of a file is read row by row, so that the pages between are not loaded.

@@ -4,12 +4,12 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from g2ard.errors import InputError, damaged
 from g2ard.io.colmap import Columns, Table, TextTable, model_folder, parsing, points_file
 from g2ard.io.jsonfile import Place
 from g2ard.io.stream import MarkedPoints, PointStream
+from g2ard.io.types import Bytes, Float
 
 _POINT = Columns.of("QdddBBBdQ", "POINT3D_ID", *"XYZRGB", "ERROR", "TRACK")
 _NUMBERS = Columns.of("ddddddd", "POINT3D_ID", *"XYZRGB")
@@ -39,7 +39,7 @@ class Stream(PointStream):
             yield self._positions[part], colors, np.zeros(len(colors), bool)
 
 
-def _binary(path: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
+def _binary(path: Path) -> tuple[Float, Bytes]:
     """Read rows of id, x y z, r g b, error and a track of variable length."""
     table = Table(path, "point")
     count, size = table.count, len(table.data)
@@ -53,7 +53,7 @@ def _binary(path: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
     return positions, rgb
 
 
-def _text(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _text(path: Path) -> tuple[Float, Float]:
     table = TextTable(path, "point")
     rows = [table.words[1:7] for _ in table]
     plain = all(word.isascii() and "_" not in word for words in rows for word in words)  # float() reads both

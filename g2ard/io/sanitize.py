@@ -5,14 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from g2ard.config.choices import RenderModel
 from g2ard.errors import InputError
-from g2ard.io.types import Note, Noted
+from g2ard.io.types import Float, Float32, Mask, Note, Noted, Values
 from g2ard.progress import plural
 from g2ard.scene.splats import DRAWN_LOGIT, Splats
 
@@ -34,18 +32,18 @@ _Up = tuple[float, float, float] | None
 class Raw:
     """A scene as stored in files: log-scales and logits, in writable C-contiguous float32 arrays."""
 
-    means: NDArray[np.float32]
-    quats: NDArray[np.float32]
-    log_scales: NDArray[np.float32]
-    logit_opacities: NDArray[np.float32]
-    sh0: NDArray[np.float32]
-    shN: NDArray[np.float32]
+    means: Float32
+    quats: Float32
+    log_scales: Float32
+    logit_opacities: Float32
+    sh0: Float32
+    shN: Float32
 
     @classmethod
     def empty(cls, count: int, rest: int) -> Raw:
         """Allocate `count` Gaussians with `rest` coefficients past band 0."""
 
-        def room(*shape: int) -> NDArray[np.float32]:
+        def room(*shape: int) -> Float32:
             return np.empty((count, *shape), np.float32)
 
         return cls(room(3), room(4), room(3), room(), room(1, 3), room(rest, 3))
@@ -54,18 +52,18 @@ class Raw:
         """Return a view of some rows."""
         return Raw(*(array[rows] for array in vars(self).values()))
 
-    def fill(self, arrays: Iterable[NDArray[Any]]) -> None:
+    def fill(self, arrays: Iterable[Values]) -> None:
         """Copy the arrays of a scene in the order of these, from the first row and coefficient on."""
         for own, values in zip(vars(self).values(), arrays, strict=True):
             own[tuple(map(slice, values.shape))] = values
 
-    def set_linear(self, scales: NDArray[Any], alphas: NDArray[Any]) -> None:
+    def set_linear(self, scales: Values, alphas: Values) -> None:
         """Store scales and opacities as logarithms and logits; rows of negative scales become NaN."""
         with np.errstate(divide="ignore", invalid="ignore"):
             self.log_scales[:] = np.log(scales.astype(np.float64))
             self.logit_opacities[:] = logits_of(alphas.astype(np.float64))
 
-    def activated(self, render_model: RenderModel, offset: NDArray[np.float64], axis: _Up = None) -> Splats:
+    def activated(self, render_model: RenderModel, offset: Float, axis: _Up = None) -> Splats:
         """Return the scene, after `Tally.clean` has exponentiated `log_scales` in place."""
         means, quats, scales, logits, sh0, shN = vars(self).values()
         return Splats(means, quats, scales, logits, sh0, shN, offset, render_model, axis)
@@ -101,7 +99,7 @@ class Tally:
     quats: int = 0
     brightest: float = -LOGIT_LIMIT
 
-    def _count(self, good: NDArray[np.bool_]) -> None:
+    def _count(self, good: Mask) -> None:
         """Count rows, given an (n,) mask of those that are finite."""
         lost = len(good) - int(np.count_nonzero(good))
         if lost and not self.dropped:
@@ -109,9 +107,7 @@ class Tally:
         self.dropped += lost
         self.rows += len(good)
 
-    def keep(
-        self, positions: NDArray[Any], colors: NDArray[Any], noise: NDArray[np.bool_]
-    ) -> NDArray[np.bool_]:
+    def keep(self, positions: Values, colors: Values, noise: Mask) -> Mask:
         """Return an (n,) mask of the finite points that are not noise, and count all."""
         good = np.all(np.isfinite(positions), axis=1) & np.all(np.isfinite(colors), axis=1)
         self._count(good)
@@ -126,7 +122,7 @@ class Tally:
         for name in ("rows", "dropped", "noise"):
             setattr(self, name, getattr(self, name) + getattr(other, name))
 
-    def clean(self, raw: Raw) -> NDArray[np.bool_]:
+    def clean(self, raw: Raw) -> Mask:
         """Clamp and activate rows in place, making `log_scales` linear; return an (N,) mask to keep."""
         keep = np.ones(len(raw.means), bool)
         for start in range(0, len(keep), BLOCK):
@@ -134,7 +130,7 @@ class Tally:
             keep[rows] = self._clean(raw.take(rows))
         return keep
 
-    def _clean(self, raw: Raw) -> NDArray[np.bool_]:
+    def _clean(self, raw: Raw) -> Mask:
         logits, scales, quats = raw.logit_opacities, raw.log_scales, raw.quats
         good = ~np.isnan(logits) & ~(np.isnan(scales) | (scales == np.inf)).any(1)
         for values in (raw.means, quats, raw.sh0, raw.shN):
@@ -194,14 +190,14 @@ class Tally:
         return notes
 
 
-def logits_of(alphas: NDArray[Any]) -> NDArray[Any]:
+def logits_of(alphas: Values) -> Values:
     """Return the logits of opacities; ±∞ for 1 and 0."""
     with np.errstate(divide="ignore", invalid="ignore"):
-        logits: NDArray[Any] = np.log(alphas) - np.log1p(-alphas)
+        logits: Values = np.log(alphas) - np.log1p(-alphas)
     return logits
 
 
-def _finite_rows(values: NDArray[Any]) -> NDArray[np.bool_]:
+def _finite_rows(values: Values) -> Mask:
     flat = values.reshape(len(values), -1)
     finite = np.isfinite(flat)
     return np.ones(len(flat), bool) if finite.all() else finite.all(1)

@@ -18,7 +18,6 @@ from typing import Annotated, Any, Literal
 import msgspec
 import numpy as np
 from msgspec import UNSET, UnsetType
-from numpy.typing import NDArray
 from PIL.Image import Image
 
 from g2ard.config.choices import Axes, RenderModel
@@ -29,7 +28,7 @@ from g2ard.io.paths import check_regular, check_unpacked, decoded, file_identity
 from g2ard.io.photos import opened_image
 from g2ard.io.sanitize import BLOCK, Raw, logits_of
 from g2ard.io.stream import RawStream, from_row
-from g2ard.io.types import Note
+from g2ard.io.types import Bytes, Float32, Note, Values
 from g2ard.progress import plural
 from g2ard.scene.transform import moved_axes, one_model
 
@@ -124,12 +123,12 @@ class _Chunk:
         with opened_image(self.place / name, io.BytesIO(self.read(name))) as image:
             yield image
 
-    def image(self, name: str) -> NDArray[np.uint8]:
+    def image(self, name: str) -> Bytes:
         """Return (height, width, 4) bytes."""
         with self.opened_image(name) as image:
             return np.asarray(image.convert("RGBA"))
 
-    def rows(self, name: str, count: int) -> NDArray[np.uint8]:
+    def rows(self, name: str, count: int) -> Bytes:
         """Return (count, 4) bytes, one pixel per Gaussian."""
         pixels = self.image(name).reshape(-1, 4)
         if len(pixels) < count:
@@ -163,7 +162,7 @@ class _Chunk:
             raise InputError(text, path=self.place / file)
         return rest
 
-    def means(self, count: int) -> NDArray[np.float32]:
+    def means(self, count: int) -> Float32:
         """Decode only the (count, 3) means."""
         low, high = (self.rows(name, count) for name in self.meta.means.files[:2])
         means = np.empty((count, 3), np.float32)
@@ -209,7 +208,7 @@ class _Decoder:
         if self._rest:
             self._fill_rest(rows, raw.shN)
 
-    def _fill_rest(self, rows: slice, out: NDArray[np.float32]) -> None:
+    def _fill_rest(self, rows: slice, out: Float32) -> None:
         """Look up palette entries by label."""
         index = self._labels[rows, 0] + (self._labels[rows, 1].astype(np.intp) << 8)
         if index.max() >= len(self._palette):
@@ -223,22 +222,20 @@ class _Decoder:
         np.take(self._palette, index, axis=0, out=out[:, : self._rest], mode="clip")
 
 
-def _fill_means(
-    out: NDArray[np.float32], low: NDArray[np.uint8], high: NDArray[np.uint8], positions: NDArray[Any]
-) -> None:
+def _fill_means(out: Float32, low: Bytes, high: Bytes, positions: Values) -> None:
     """Decode positions from 16-bit codes, a byte from each of two images."""
     for axis in range(3):
         out[:, axis] = positions[axis][low[:, axis] + (high[:, axis].astype(int) << 8)]
 
 
-def _positions(part: _Means) -> NDArray[Any]:
+def _positions(part: _Means) -> Values:
     """Return the (3, 65536) values of codes per axis, which are stored as sign(x)·ln(|x| + 1)."""
     low, high = (np.broadcast_to(np.atleast_1d(bound)[:3], 3) for bound in (part.mins, part.maxs))
     logs = low + (high - low) * (np.arange(65536)[:, None] / 65535)
     return (np.sign(logs) * np.expm1(np.abs(logs))).T.astype(np.float32)
 
 
-def _logits(place: Place, part: _Part) -> NDArray[Any]:
+def _logits(place: Place, part: _Part) -> Values:
     """Return the (256,) logits of opacity bytes, which are α in version 2 and logits in version 1."""
     alpha = np.arange(256) / 255
     if part.codebook is UNSET:
@@ -247,13 +244,13 @@ def _logits(place: Place, part: _Part) -> NDArray[Any]:
     return logits_of(alpha)
 
 
-def _bound(place: Place, bound: _Bound | None, channels: slice) -> NDArray[Any]:
+def _bound(place: Place, bound: _Bound | None, channels: slice) -> Values:
     if bound is None or (isinstance(bound, list) and len(bound) < channels.stop):
         raise (place if bound is None else place.to(3)).error("is missing")
     return np.asarray(bound[channels] if isinstance(bound, list) else bound)
 
 
-def _values(place: Place, part: _Part) -> Callable[[NDArray[np.uint8]], NDArray[Any]]:
+def _values(place: Place, part: _Part) -> Callable[[Bytes], Values]:
     """Return the values of bytes: from a codebook (version 2), or between mins and maxs (version 1)."""
     if part.codebook is UNSET:
         low, high = (_bound(place.to(name), getattr(part, name), slice(3)) for name in ("mins", "maxs"))
@@ -264,7 +261,7 @@ def _values(place: Place, part: _Part) -> Callable[[NDArray[np.uint8]], NDArray[
         raise place.to(int(np.argmax(wrong))).error("is beyond the range of float32")
     table = book.astype(np.float32)
 
-    def looked_up(codes: NDArray[np.uint8]) -> NDArray[Any]:
+    def looked_up(codes: Bytes) -> Values:
         if len(table) < 256 and codes.size and (top := int(codes.max())) >= len(table):
             raise place.error(f"has {len(table)} numbers, expected at least {top + 1}")
         return table[codes]
@@ -272,7 +269,7 @@ def _values(place: Place, part: _Part) -> Callable[[NDArray[np.uint8]], NDArray[
     return looked_up
 
 
-def _quats(codes: NDArray[np.uint8]) -> NDArray[Any]:
+def _quats(codes: Bytes) -> Values:
     """Decode (N, 4) wxyz: three components in ±1/√2; the fourth byte − 252 is the index of the largest.
 
     Other fourth bytes give a zero quaternion, which later becomes the identity, with a note.
@@ -282,9 +279,7 @@ def _quats(codes: NDArray[np.uint8]) -> NDArray[Any]:
     return quats
 
 
-def _palette(
-    chunk: _Chunk, part: _Rest, rest: int, count: int
-) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+def _palette(chunk: _Chunk, part: _Rest, rest: int, count: int) -> tuple[Float32, Bytes]:
     """Return the (entries, K−1, 3) coefficients of the palette, and the labels."""
     centroids, labels = _sh_files(part)
     image = chunk.image(centroids)
@@ -409,7 +404,7 @@ class Stream(RawStream):
         places = (place.iterdir() if place.is_dir() else [place] for place in chunks_of(self.path))
         return file_identity(sorted(file for files in places for file in files if file.is_file()))
 
-    def positions(self, rows: int) -> Iterator[NDArray[np.float32]]:
+    def positions(self, rows: int) -> Iterator[Float32]:
         with _opened(self.path) as chunks:
             for chunk, count in zip(chunks, self._counts, strict=True):
                 yield self.in_axes(chunk.means(count))

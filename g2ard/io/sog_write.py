@@ -14,7 +14,6 @@ import json
 import math
 import zipfile
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,6 +32,7 @@ from g2ard.io.packing import (
     unit_quats,
     writable,
 )
+from g2ard.io.types import Bytes, Float, Float32, Values
 from g2ard.progress import Progress, silent
 from g2ard.scene.shape import longer_axes
 from g2ard.scene.splats import Splats
@@ -110,7 +110,7 @@ def sog_files(
     images = 7 if splats.sh_degree else 5
     progress("sog", 0, images)
 
-    def image(name: str, pixels: NDArray[Any]) -> str:
+    def image(name: str, pixels: Values) -> str:
         room = np.zeros((width * height, 4), np.uint8)
         room[:, 3] = 255
         room[: len(pixels), : pixels.shape[1]] = pixels
@@ -149,7 +149,7 @@ def _size(path: Path, count: int) -> tuple[int, int]:
     return width, height
 
 
-def _webp(pixels: NDArray[np.uint8]) -> bytes:
+def _webp(pixels: Bytes) -> bytes:
     from PIL import (
         Image,
         WebPImagePlugin,  # noqa: F401  (Pillow would load all its formats to find this one)
@@ -161,7 +161,7 @@ def _webp(pixels: NDArray[np.uint8]) -> bytes:
     return buffer.getvalue()
 
 
-def _means(splats: Splats) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
+def _means(splats: Splats) -> tuple[Float, Float, NDArray[np.int64]]:
     """Return the bounds of the logarithms per axis, and (N, 3) 16-bit codes between them."""
     means = splats.means.astype(np.float64)
     logs = np.sign(means) * np.log1p(np.abs(means))
@@ -169,20 +169,20 @@ def _means(splats: Splats) -> tuple[NDArray[np.float64], NDArray[np.float64], ND
     return low, high, coded((logs - low) / np.where(high > low, high - low, 1.0), 65535)
 
 
-def _numbers(values: NDArray[Any]) -> tuple[NDArray[np.float32], NDArray[np.intp]]:
+def _numbers(values: Values) -> tuple[Float32, NDArray[np.intp]]:
     """Return a codebook of 256 entries, and the nearest entry of every value."""
     values = np.ascontiguousarray(values, np.float32)
     book = _core.codebook(values.ravel(), 256)
     return book, nearest(book, values)
 
 
-def nearest(book: NDArray[np.float32], values: NDArray[np.float32]) -> NDArray[np.intp]:
+def nearest(book: Float32, values: Float32) -> NDArray[np.intp]:
     """Return the entry of an ascending codebook nearest to each value."""
     wide = book.astype(np.float64)
     return np.searchsorted((wide[1:] + wide[:-1]) / 2, values)
 
 
-def _weights(splats: Splats) -> NDArray[np.float32]:
+def _weights(splats: Splats) -> Float32:
     """Return (N,) weights √(α·A) over their mean, A the product of the two larger scales.
 
     The root gains 0.35 dB over equal weights on a scene at 10×; α·A itself gains nothing.
@@ -193,7 +193,7 @@ def _weights(splats: Splats) -> NDArray[np.float32]:
     return (shown / mean if mean > 0 else np.ones(len(splats))).astype(np.float32)
 
 
-def _rest(splats: Splats) -> tuple[int, NDArray[np.float32], NDArray[np.uint8], NDArray[np.uint32]]:
+def _rest(splats: Splats) -> tuple[int, Float32, Bytes, NDArray[np.uint32]]:
     """Return the palette's size, codebook and image, and the (N,) entries of Gaussians."""
     rest = splats.shN.shape[1]
     points = np.ascontiguousarray(splats.shN.reshape(len(splats), 3 * rest))

@@ -5,13 +5,13 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from g2ard.errors import InputError
 from g2ard.io.colmap import model_folder
 from g2ard.io.finding import usable
 from g2ard.io.jsonfile import read_json
 from g2ard.io.paths import content_hash, read_text, real_path
+from g2ard.io.types import Mask
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.lenses import photo_of
 
@@ -21,7 +21,7 @@ HOLD_OUT = 8
 
 def split_mask(
     views: str | Path | None, names: Sequence[str], which: str, *, stated: Sequence[str | None] = ()
-) -> NDArray[np.bool_]:
+) -> Mask:
     """Return the mask of views in a split.
 
     Splits come from the views themselves, otherwise from a split.json beside them ({"train": [names], "test":
@@ -75,18 +75,14 @@ def splits_of(
     return tuple(next((word for word in order if masks[word][i]), None) for i in range(len(names)))
 
 
-def for_training(
-    views: str | Path | None, names: Sequence[str], stated: Sequence[str | None] = ()
-) -> NDArray[np.bool_]:
+def for_training(views: str | Path | None, names: Sequence[str], stated: Sequence[str | None] = ()) -> Mask:
     """Return the (C,) mask of views to train on when other views are scored: "train" if splits are stated,
     otherwise all. Arguments are those of `split_mask`.
     """
     return split_mask(views, names, "train" if states_splits(views, stated) else "all", stated=stated)
 
 
-def for_scores(
-    views: str | Path | None, names: Sequence[str], stated: Sequence[str | None] = ()
-) -> NDArray[np.bool_]:
+def for_scores(views: str | Path | None, names: Sequence[str], stated: Sequence[str | None] = ()) -> Mask:
     """Return the (C,) mask of views to score on in a file for scoring: all except those stated as "train".
 
     Arguments are those of `split_mask`.
@@ -101,9 +97,7 @@ def for_scores(
     return mask
 
 
-def _masks(
-    views: str | Path | None, names: Sequence[str], stated: Sequence[str | None]
-) -> dict[str, NDArray[np.bool_]]:
+def _masks(views: str | Path | None, names: Sequence[str], stated: Sequence[str | None]) -> dict[str, Mask]:
     """Return split → (C,) mask: as stated, as listed in split.json, or by the rule."""
     if any(stated):
         return {word: np.array([s == word for s in stated], bool) for word in {s for s in stated if s}}
@@ -167,7 +161,7 @@ def _places(views: Path) -> list[Path]:
     return [folder, *folder.parents[:above]]
 
 
-def _listed(names: Sequence[str], wanted: Sequence[str]) -> NDArray[np.bool_]:
+def _listed(names: Sequence[str], wanted: Sequence[str]) -> Mask:
     """Match names by stem, so that suffix and folder may differ, unless stems are ambiguous."""
     photos = [photo_of(name) for name in names]
     stems = [PurePosixPath(name).stem for name in photos]
@@ -180,7 +174,7 @@ def _listed(names: Sequence[str], wanted: Sequence[str]) -> NDArray[np.bool_]:
     return np.array([stem in chosen for stem in stems], bool)
 
 
-def not_held_out(cameras: Cameras, held_out: Cameras) -> NDArray[np.bool_]:
+def not_held_out(cameras: Cameras, held_out: Cameras) -> Mask:
     """Return the (C,) mask of views that are not held out: no view held out has their photo, a copy of it, or
     their pose."""
     alike = same_photos(cameras.image_paths, held_out.image_paths, copies=True)
@@ -196,9 +190,7 @@ _SAME_POSE = 1e-6
 """Difference of rotations, and of positions as a share of their extent, that single precision may make."""
 
 
-def same_photos(
-    files: Sequence[Path | None], others: Sequence[Path | None], *, copies: bool = False
-) -> NDArray[np.bool_]:
+def same_photos(files: Sequence[Path | None], others: Sequence[Path | None], *, copies: bool = False) -> Mask:
     """Return whether each photo is one of `others`, by whatever name; with `copies`, also by content."""
     known = {real_path(path) for path in others if path is not None}
     alike = np.array([path is not None and real_path(path) in known for path in files], bool)

@@ -26,7 +26,7 @@ from g2ard.io.jsonfile import Place as JsonPlace
 from g2ard.io.jsonfile import Vector, checked, parse_json
 from g2ard.io.paths import check_unpacked
 from g2ard.io.sanitize import Raw, cleaned, logits_of
-from g2ard.io.types import Note, Noted
+from g2ard.io.types import Bytes, Float, Note, Noted, Values
 from g2ard.progress import Progress, plural, silent
 from g2ard.scene.splats import Splats
 from g2ard.scene.transform import change_of_axes, harmonic_signs, moved_axes, restored, with_axes
@@ -239,21 +239,21 @@ def _unpacked(path: Path, frame: bytes, size: int) -> bytes:
         raise damaged(f"broken Zstandard stream ({error})", path=path) from error
 
 
-def _fixed24(triples: NDArray[np.uint8]) -> NDArray[np.int32]:
+def _fixed24(triples: Bytes) -> NDArray[np.int32]:
     """Decode signed 24-bit little-endian integers."""
     wide = np.zeros((len(triples), 4), np.uint8)
     wide[:, 1:] = triples
     return wide.view("<i4")[:, 0] >> 8
 
 
-def _quats_xyz(codes: NDArray[np.uint8]) -> NDArray[np.float64]:
+def _quats_xyz(codes: Bytes) -> Float:
     """Decode quaternions of version 2: x y z as bytes in [−1, 1], with w ≥ 0."""
     xyz = codes.reshape(-1, 3) / 127.5 - 1
     w = np.sqrt(np.maximum(0, 1 - (xyz**2).sum(1)))
     return np.concatenate([w[:, None], xyz], axis=1)
 
 
-def _quats_packed(codes: NDArray[np.uint8]) -> NDArray[np.float64]:
+def _quats_packed(codes: Bytes) -> Float:
     """Decode quaternions of versions 3 and 4: 2 bits for the largest of x y z w, and 9 bits of |q|·√2 plus a
     sign for the others."""
     packed = codes.view("<u4")
@@ -306,7 +306,7 @@ def write(
     return error + rounding(means, bits)
 
 
-def rounding(means: NDArray[Any], bits: int) -> float:
+def rounding(means: Values, bits: int) -> float:
     """Return the largest change of a coordinate in `bits` fractional bits."""
     scaled = np.asarray(means, np.float64) * (1 << bits)
     return float(np.abs(np.rint(scaled) - scaled).max()) / (1 << bits)
@@ -315,7 +315,7 @@ def rounding(means: NDArray[Any], bits: int) -> float:
 def encoded(
     path: Path,
     splats: Splats,
-    means: NDArray[np.float64],
+    means: Float,
     bits: int,
     spz_version: int,
     axes: Axes = "RUB",
@@ -363,15 +363,13 @@ def _gzipped(content: bytes, progress: Progress, comment: bytes) -> bytes:
     return packed[:3] + bytes([_COMMENTED]) + packed[4:10] + comment + b"\0" + packed[10:]
 
 
-def check_far(
-    path: Path, splats: Splats, means: NDArray[np.float64], widened: float = 1.0, movable: bool = False
-) -> None:
+def check_far(path: Path, splats: Splats, means: Float, widened: float = 1.0, movable: bool = False) -> None:
     """Raise the error of `fraction_bits` for a scene whose Gaussians will be `widened` times as large."""
     wide = replace(splats, scales=splats.scales * np.float32(widened))
     fraction_bits(path, means, wide, movable=movable)
 
 
-def fraction_bits(path: Path, means: NDArray[np.float64], splats: Splats, *, movable: bool = False) -> int:
+def fraction_bits(path: Path, means: Float, splats: Splats, *, movable: bool = False) -> int:
     """Return the fractional bits of 24-bit coordinates.
 
     Usually 12. More, as far as the extent allows, if a step of 2^−12 exceeds a quarter of the 1st percentile
@@ -413,7 +411,7 @@ def fraction_bits(path: Path, means: NDArray[np.float64], splats: Splats, *, mov
     )
 
 
-def _streams(splats: Splats, means: NDArray[np.float64], bits: int, version: int) -> list[bytes]:
+def _streams(splats: Splats, means: Float, bits: int, version: int) -> list[bytes]:
     fixed = np.rint(means * (1, -1, -1) * (1 << bits)).astype("<i4")
     quats = packing.unit_quats(splats.quats) * (1, 1, -1, -1)
     signs = np.where(quats[:, :1] < 0, -1, 1)  # w ≥ 0
@@ -430,11 +428,11 @@ def _streams(splats: Splats, means: NDArray[np.float64], bits: int, version: int
     return streams
 
 
-def _bytes(values: NDArray[Any]) -> bytes:
+def _bytes(values: Values) -> bytes:
     return packing.as_bytes(values).tobytes()
 
 
-def _packed(quats: NDArray[np.float64]) -> bytes:
+def _packed(quats: Float) -> bytes:
     largest, others = packing.smallest_three(quats[:, [1, 2, 3, 0]])
     words = largest.astype(np.uint32)
     for k in range(3):

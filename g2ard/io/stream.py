@@ -10,14 +10,13 @@ from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from g2ard.config.choices import Axes, RenderModel
 from g2ard.errors import InputError
 from g2ard.io import judge
 from g2ard.io.paths import file_identity
 from g2ard.io.sanitize import BLOCK, Raw, Tally
-from g2ard.io.types import Cloud, Note, Points
+from g2ard.io.types import Cloud, Float, Float32, Mask, Note, Points
 from g2ard.progress import plural
 from g2ard.scene.splats import ARRAYS, Splats
 from g2ard.scene.transform import change_of_axes, common_axes, one_model, restored, stand_as
@@ -25,10 +24,10 @@ from g2ard.scene.transform import change_of_axes, common_axes, one_model, restor
 _DEGREE_OF_REST = {0: 0, 3: 1, 8: 2, 15: 3}
 _POINTS_AT_ONCE = 1 << 20
 
-RawPoints = tuple[NDArray[np.float64], NDArray[np.float32]]
+RawPoints = tuple[Float, Float32]
 """(n, 3) positions, world units, and (n, 3) colours in [0, 1]."""
 
-MarkedPoints = tuple[NDArray[np.float64], NDArray[np.float32], NDArray[np.bool_]]
+MarkedPoints = tuple[Float, Float32, Mask]
 """(n, 3) positions; (n, 3) colours, (n, 1) intensities or (n, 0); (n,) whether the file marks noise."""
 
 _BLACK = 1.5 / 255  # colours below are taken for none
@@ -57,7 +56,7 @@ class Stream(ABC, Generic[Block]):
         self,
         path: Path,
         count: int,
-        offset: NDArray[np.float64] | None,
+        offset: Float | None,
         notes: tuple[Note, ...] = (),
         item: str = "Gaussian",
     ) -> None:
@@ -72,7 +71,7 @@ class Stream(ABC, Generic[Block]):
         return file_identity([self.path])
 
     @abstractmethod
-    def positions(self, rows: int) -> Iterator[NDArray[np.float32]]:
+    def positions(self, rows: int) -> Iterator[Float32]:
         """Yield the (n, 3) positions of all rows in blocks, relative to `offset`, without cleaning."""
 
     @abstractmethod
@@ -103,7 +102,7 @@ class SceneStream(Stream[Splats]):
         path: Path,
         count: int,
         rest: int = 0,
-        offset: NDArray[np.float64] | None = None,
+        offset: Float | None = None,
         notes: tuple[Note, ...] = (),
         render_model: RenderModel = "classic",
     ) -> None:
@@ -133,7 +132,7 @@ class RawStream(SceneStream):
         found = restored(whole, axes)
         self.axes, self.offset, self.up = axes, found.offset, found.up
 
-    def in_axes(self, means: NDArray[np.float32]) -> NDArray[np.float32]:
+    def in_axes(self, means: Float32) -> Float32:
         """Return stored means in the scene's axes."""
         if self.axes == "RDF":
             return means
@@ -143,7 +142,7 @@ class RawStream(SceneStream):
     def raw(self, rows: int, start: int) -> Iterator[Raw]:
         """Yield the source's rows from `start`, at most `rows` at a time; callers may change the arrays."""
 
-    def positions(self, rows: int) -> Iterator[NDArray[np.float32]]:
+    def positions(self, rows: int) -> Iterator[Float32]:
         return (self.in_axes(raw.means) for raw in self.raw(rows, 0))
 
     def blocks(self, rows: int, start: int = 0) -> Iterator[Splats]:
@@ -167,7 +166,7 @@ class PartsStream(SceneStream):
         counts: Sequence[int],
         part: Callable[[int], Splats],
         sh_degree: int,
-        offset: NDArray[np.float64],
+        offset: Float,
         identity: list[Any] | None = None,
         notes: tuple[Note, ...] = (),
         render_model: RenderModel = "classic",
@@ -190,7 +189,7 @@ class PartsStream(SceneStream):
             return super().whole()
         return replace(self._part(0), render_model=self.render_model, axes=self.axes)
 
-    def positions(self, rows: int) -> Iterator[NDArray[np.float32]]:
+    def positions(self, rows: int) -> Iterator[Float32]:
         return (self._part(number).means for number in range(len(self.counts)))
 
     def blocks(self, rows: int, start: int = 0) -> Iterator[Splats]:
@@ -257,7 +256,7 @@ class PointStream(Stream[RawPoints]):
             self.channels = int(self._range[0] < self._range[1])
         self.black = self.bright = 0
 
-    def shown(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
+    def shown(self, values: Float32) -> Float32:
         """Return stored values as (n, 3) colours in [0, 1]."""
         if not self.channels:
             return np.zeros((len(values), 3), np.float32)
@@ -298,12 +297,12 @@ class PointStream(Stream[RawPoints]):
             notes.append(Note("bright_points", self.bright, text))
         return tuple(notes)
 
-    def near(self, positions: NDArray[np.float64]) -> NDArray[np.float32]:
+    def near(self, positions: Float) -> Float32:
         """Return positions relative to `offset`."""
         with np.errstate(over="ignore", invalid="ignore"):
             return (positions - self.offset).astype(np.float32)
 
-    def positions(self, rows: int) -> Iterator[NDArray[np.float32]]:
+    def positions(self, rows: int) -> Iterator[Float32]:
         for positions, _, noise in self.marked(rows, 0):
             near = self.near(positions)
             near[noise] = np.nan
@@ -337,7 +336,7 @@ _DEGREES = Note(
 )
 
 
-def _in_degrees(middle: NDArray[np.float64], extent: NDArray[np.float64]) -> bool:
+def _in_degrees(middle: Float, extent: Float) -> bool:
     """Return whether x and y may be degrees, z metres: far from 0, and of much smaller extent than z."""
     wide = float(extent[:2].max())
     on_globe = (np.abs(middle[:2]) <= 180).all() and np.abs(middle[:2]).min() <= 90
@@ -369,7 +368,7 @@ class JoinedScenes(Joined[Splats], SceneStream):
         self.up = ups.pop() if len(ups) == 1 else None
         self.axes = common_axes([stream.axes for stream in streams])
 
-    def positions(self, rows: int) -> Iterator[NDArray[np.float32]]:
+    def positions(self, rows: int) -> Iterator[Float32]:
         for stream in self.streams:
             for means in stream.positions(rows):
                 yield self._moved(means, stream.offset)
@@ -382,7 +381,7 @@ class JoinedScenes(Joined[Splats], SceneStream):
                 means = self._moved(block.means, stream.offset)
                 yield replace(block.with_sh_degree(self.sh_degree), means=means, offset=self.offset)
 
-    def _moved(self, means: NDArray[np.float32], offset: NDArray[np.float64]) -> NDArray[np.float32]:
+    def _moved(self, means: Float32, offset: Float) -> Float32:
         shift = offset - self.offset
         return (means + shift).astype(np.float32) if shift.any() else means
 

@@ -23,7 +23,7 @@ from g2ard.io.detect import MANIFEST
 from g2ard.io.jsonfile import Number, Place, Vector, Whole, checked, read_own
 from g2ard.io.sanitize import Raw
 from g2ard.io.stream import PartsStream
-from g2ard.io.types import Note
+from g2ard.io.types import Float, Float32, Note
 from g2ard.scene.kdtree import KdTree
 from g2ard.scene.splats import Splats
 
@@ -45,7 +45,7 @@ def row_width(sh_degree: int) -> int:
     return 14 + 3 * ((sh_degree + 1) ** 2 - 1)
 
 
-def packed(splats: Splats) -> NDArray[np.float32]:
+def packed(splats: Splats) -> Float32:
     """Return (N, 14 + 3K) rows as stored in tiles."""
     rows = np.empty((len(splats), row_width(splats.sh_degree)), "<f4")
     rows[:, 0:3] = splats.means
@@ -115,7 +115,7 @@ class TileStore:
     tiles: tuple[Tile, ...]
     count: int
     sh_degree: int
-    offset: NDArray[np.float64]
+    offset: Float
     margin: float
     tree: KdTree
     notes: tuple[Note, ...]
@@ -199,7 +199,7 @@ class TileStore:
         tile = self.tiles[index]
         return self._read(halo_name(index), tile.halo, tile.checks[1], sh)
 
-    def rows(self, index: int) -> NDArray[np.float32]:
+    def rows(self, index: int) -> Float32:
         """Return a (rows, 14 + 3K) memory map of a tile's own rows; `check` verifies its contents.
 
         Raises:
@@ -245,7 +245,7 @@ class TileStore:
         self._check_size(name, count)
         crc = 0
 
-        def blocks() -> Iterator[NDArray[np.float32]]:
+        def blocks() -> Iterator[Float32]:
             nonlocal crc
             with (self.folder / name).open("rb") as file:
                 for start in range(0, count, _ROWS_AT_ONCE):
@@ -257,7 +257,7 @@ class TileStore:
         self._check_contents(name, crc, check)
         return scene
 
-    def unpacked(self, count: int, blocks: Iterable[NDArray[np.float32]], *, sh: bool = True) -> Splats:
+    def unpacked(self, count: int, blocks: Iterable[Float32], *, sh: bool = True) -> Splats:
         """Return the scene of `count` packed rows, given in blocks; `sh` as for `read`."""
         rest = (self.sh_degree + 1) ** 2 - 1 if sh else 0
         raw, start = Raw.empty(count, rest), 0
@@ -272,7 +272,7 @@ class TileStore:
     def __len__(self) -> int:
         return self.count
 
-    def positions(self) -> Iterator[NDArray[np.float32]]:
+    def positions(self) -> Iterator[Float32]:
         """Yield the (n, 3) means of each tile in order, memory-mapped, after verifying its contents."""
         for tile in self.tiles:
             self.check(tile.index)

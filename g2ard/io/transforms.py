@@ -9,14 +9,13 @@ from typing import Any
 import msgspec
 import numpy as np
 from msgspec import UNSET, UnsetType
-from numpy.typing import NDArray
 
 from g2ard.errors import InputError
 from g2ard.io.finding import Finder, is_end
 from g2ard.io.jsonfile import Number, Place, Pose, Vector, Whole, checked, read_json
 from g2ard.io.paths import beside
 from g2ard.io.photos import Frame, Lens, Listed, fits, inverse, photo_size, rigid
-from g2ard.io.types import Note, ViewFiles
+from g2ard.io.types import Float, Note, ViewFiles
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.lenses import PhotoLens
 
@@ -208,7 +207,7 @@ def _from_matrix_city(folder: Path, frame: _Numbered) -> dict[str, Any]:
     return {"file_path": (places or [""])[0] + name, "transform_matrix": frame.rot_mat}
 
 
-def opencv_view(world_from_camera: NDArray[np.float64]) -> NDArray[np.float64]:
+def opencv_view(world_from_camera: Float) -> Float:
     """Convert a rigid world_from_camera in OpenGL axes to a (4, 4) camera_from_world in OpenCV axes."""
     return inverse(world_from_camera @ FLIP)
 
@@ -258,7 +257,7 @@ def _pinhole(place: Place, frame: _Frame, size: tuple[int, int]) -> Lens:
     return Lens.pinhole((width, height), (fx, fy), (cx, cy), distortion)
 
 
-def _matrix(place: Place, frame: _Frame) -> NDArray[np.float64] | None:
+def _matrix(place: Place, frame: _Frame) -> Float | None:
     """Return a frame's 3×3 `K` or `intrinsics`, without skew, or None."""
     key = next((key for key in ("K", "intrinsics") if isinstance(getattr(frame, key), list)), None)
     if key is None:

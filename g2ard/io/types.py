@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +14,13 @@ from g2ard.errors import InputError
 from g2ard.progress import plural
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats, unit_colors
+
+Values = NDArray[Any]
+Float = NDArray[np.float64]
+Float32 = NDArray[np.float32]
+Bytes = NDArray[np.uint8]
+Mask = NDArray[np.bool_]
+"""Arrays of numbers of any type, and of the usual types."""
 
 
 @dataclass(frozen=True)
@@ -44,8 +52,8 @@ class Points:
         InputError: the shapes do not match, or a colour is outside [0, 1].
     """
 
-    positions: NDArray[np.float64]
-    colors: NDArray[np.float32]
+    positions: Float
+    colors: Float32
 
     def __post_init__(self) -> None:
         if self.positions.ndim != 2 or self.positions.shape[1] != 3:
@@ -78,7 +86,7 @@ class Cloud:
 
     points: Points
     notes: tuple[Note, ...]
-    colored: NDArray[np.bool_]
+    colored: Mask
     axes: Axes | None = None
 
     def __len__(self) -> int:
@@ -115,9 +123,9 @@ class ViewSet:
     cameras: Cameras
     notes: tuple[Note, ...] = ()
     splits: tuple[str | None, ...] = ()
-    weights: NDArray[np.float64] | None = None
+    weights: Float | None = None
 
-    def take(self, mask: NDArray[np.bool_]) -> ViewSet:
+    def take(self, mask: Mask) -> ViewSet:
         """Select views by a (C,) mask."""
         rows = np.flatnonzero(mask)
         splits = tuple(self.splits[i] for i in rows) if self.splits else ()

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any, TextIO
 
 import numpy as np
-from numpy.typing import NDArray
 
 from g2ard.config.choices import AXES
 from g2ard.errors import InputError, OutputError, missing
@@ -22,7 +21,7 @@ from g2ard.io.packing import rounding, unit_quats, writable
 from g2ard.io.sanitize import Raw, cleaned
 from g2ard.io.signs import MESH, SCAN
 from g2ard.io.spz import FLIPS
-from g2ard.io.types import Note, Noted
+from g2ard.io.types import Float, Float32, Note, Noted
 from g2ard.progress import Progress, plural, silent
 from g2ard.scene.splats import SH_C0, Splats
 from g2ard.scene.transform import as_stored, restored
@@ -62,7 +61,7 @@ def write(path: Path, splats: Splats, *, overwrite: bool = False, progress: Prog
     return error
 
 
-def _attributes(splats: Splats) -> dict[str, tuple[str, NDArray[np.float32]]]:
+def _attributes(splats: Splats) -> dict[str, tuple[str, Float32]]:
     """Return the type and the values of each array attribute; quaternions are w x y z."""
     means = (splats.means * _USD_TURN).astype(np.float32)
     reach = _EXTENT_SIGMAS * splats.scales.max(axis=1, keepdims=True)
@@ -254,7 +253,7 @@ def _given(pxr: Any, prim: Any, name: str) -> Any:
     return values if values is not None and len(values) else None
 
 
-def _values(path: Path, pxr: Any, prim: Any, name: str, width: int, count: int | None) -> NDArray[np.float32]:
+def _values(path: Path, pxr: Any, prim: Any, name: str, width: int, count: int | None) -> Float32:
     """Return the (count, width) values of an attribute in float, or in half with an h after its name."""
     for found in (name, f"{name}h"):
         if (values := _given(pxr, prim, found)) is not None:
@@ -265,7 +264,7 @@ def _values(path: Path, pxr: Any, prim: Any, name: str, width: int, count: int |
     raise InputError(f"attribute {name!r} of {prim.GetPath()} is missing or empty", path=path)
 
 
-def _to_ply(pxr: Any, stage: Any, prim: Any) -> NDArray[np.float64]:
+def _to_ply(pxr: Any, stage: Any, prim: Any) -> Float:
     """Return the (4, 4) matrix from the prim's flipped axes to the axes of a .ply."""
     world = np.array(
         pxr.UsdGeom.XformCache(pxr.Usd.TimeCode.EarliestTime()).GetLocalToWorldTransform(prim)
