@@ -45,11 +45,11 @@ class Stream(PointStream):
         kinds = {name: self._vertices.dtype[own] for name, own in self._named.items()}
         choices = [names for names in choices if names[0] not in _PACKED or kinds[names[0]].itemsize == 4]
 
-        def sampled(names: Names) -> MarkedPoints:
+        def sampled(names: Names) -> list[MarkedPoints]:
             self._names = names
-            return self._marked(rows)
+            return [self._marked(rows)]
 
-        self._names, sample = telling(map(tuple, choices), sampled)
+        self._names, sample = telling([*map(tuple, choices)], sampled)
         packed = self._names and self._names[0] in _PACKED
         scales = [(255.0,)] if packed else [judge.full_scales(kinds[name]) for name in self._names]
         widest = max(scales, key=lambda scales: scales[-1], default=(1.0,))

@@ -2,7 +2,6 @@
 
 import io
 import re
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +10,7 @@ from g2ard.errors import InputError, damaged
 from g2ard.io import judge
 from g2ard.io.paths import decoded, plain_numbers, read_text
 from g2ard.io.signs import is_table
-from g2ard.io.stream import MarkedPoints, PointStream
+from g2ard.io.stream import HeldPoints
 from g2ard.io.types import Float
 
 _COLUMNS = {
@@ -47,7 +46,7 @@ _TYPES = {
 _LINES, _HEAD = 50, 1 << 16  # lines that may be a heading, and bytes that tell whether a text is a table
 
 
-class Stream(PointStream):
+class Stream(HeldPoints):
     """Points of a table, which is read whole. Without colours they are grey by their intensities."""
 
     def __init__(self, path: Path) -> None:
@@ -62,20 +61,11 @@ class Stream(PointStream):
         column = {name: names.index(name) for name in _COLUMNS if name in names}
         if missing := [name for name in "xyz" if name not in column]:
             raise InputError(f"has no column {missing[0]!r} (found {' '.join(names)})", path=path)
-        self._positions = table[:, [column[name] for name in "xyz"]]
         shades: tuple[str, ...] = next((names for names in _SHADES if set(names) <= set(column)), ())
-        self._values = table[:, [column[name] for name in shades]].astype(np.float32)
-        unmarked = np.zeros(len(table), bool)
-        scales = judge.full_scales(np.dtype(np.float64))
-        super().__init__(path, len(table), (self._positions, self._values, unmarked), scales)
+        positions, values = (table[:, [column[name] for name in names]] for names in ("xyz", shades))
+        super().__init__(path, positions, values, judge.full_scales(np.dtype(np.float64)))
         if not shades:
             self.lack = f"has no colours (found columns {' '.join(names)}); name them red, green and blue"
-
-    def raw(self, rows: int, start: int) -> Iterator[MarkedPoints]:
-        for first in range(start, self.count, rows):
-            part = slice(first, first + rows)
-            values = self._values[part]
-            yield self._positions[part], values, np.zeros(len(values), bool)
 
 
 def check_points(path: Path) -> None:

@@ -105,13 +105,12 @@ class _Scan(PointStream):
         scaled = ("eight_bit_colors", "color_range")  # fields have no range of their own
         return tuple(note for note in super().header_notes() if note.code not in scaled)
 
-    def _sampled(self, color: Names) -> MarkedPoints:
-        """Return points from all parts of the scan."""
+    def _sampled(self, color: Names) -> Iterator[MarkedPoints]:
+        """Yield points from all parts of the scan."""
         self._color = color
-        step = max(1, self.count // _SAMPLE_ROWS)
-        parts = [[values[::step] for values in part] for part in self.raw(_SAMPLE_ROWS, 0)]
-        positions, colors, noise = (np.concatenate(values) for values in zip(*parts, strict=True))
-        return positions, colors, noise
+        every = slice(None, None, max(1, self.count // _SAMPLE_ROWS))
+        for positions, colors, noise in self.raw(_SAMPLE_ROWS, 0):
+            yield positions[every], colors[every], noise[every]
 
     def _marks(self) -> list[str]:
         """Return the fields that mark points without positions or colours."""

@@ -331,47 +331,53 @@ def _conversion(profile: bytes | None, mode: str) -> ImageCms.ImageCmsTransform 
 
 
 def _undistorted(image: Float32, K: Float, distortion: Float) -> Float32:
-    """Sample the distorted photo for each pixel of the pinhole image, bilinearly."""
+    """Sample the distorted photo for each pixel of the pinhole image."""
     height, width = image.shape[:2]
-    rows, columns, down, right, _ = _lookup(width, height, tuple(K.ravel()), tuple(distortion))
-    flat = image.reshape(height * width, -1)
-    at = rows * width + columns
-    top = flat[at] * (1 - right) + flat[at + 1] * right
-    bottom = flat[at + width] * (1 - right) + flat[at + width + 1] * right
-    return (top * (1 - down) + bottom * down).reshape(image.shape)
+    u, v, _ = _lookup(width, height, tuple(K.ravel()), tuple(distortion))
+    return _sampled(image, u, v).reshape(image.shape)
+
+
+def _sampled(image: Float32, u: Float, v: Float, around: bool = False) -> Float32:
+    """Return the (n, C) values at n places, bilinearly. Pixels have whole numbers, and edges are repeated.
+
+    Args:
+        around: whether the last column is beside the first, as in a panorama.
+    """
+    height, width = image.shape[:2]
+    u, v = u if around else np.clip(u, 0, width - 1), np.clip(v, 0, height - 1)
+    left, above = np.floor(u).astype(int), np.floor(v).astype(int)
+    right, down = (u - left)[:, None].astype(np.float32), (v - above)[:, None].astype(np.float32)
+    top, bottom = (
+        image[row, left % width] * (1 - right) + image[row, (left + 1) % width] * right
+        for row in (above, np.minimum(above + 1, height - 1))
+    )
+    return np.asarray(top * (1 - down) + bottom * down)
 
 
 @lru_cache(maxsize=2)  # usually all photos share one lens
-def _lookup(width: int, height: int, K: tuple[float, ...], distortion: tuple[float, ...]) -> tuple[Any, ...]:
-    """Return row, column and fractions of each pixel's source, and whether the photo holds it.
+def _lookup(
+    width: int, height: int, K: tuple[float, ...], distortion: tuple[float, ...]
+) -> tuple[Float, Float, Mask]:
+    """Return column and row of each pixel's source, and whether the photo holds it.
 
     OpenCV's model, pixel centres at +0.5:
 
     x' = x·(1 + k1 r² + k2 r⁴ + k3 r⁶) + 2 p1 x y + p2 (r² + 2 x²), y' likewise with p1 and p2 exchanged.
     """
-    if width < 2 or height < 2:
-        raise InputError(f"a photo of {width}×{height} pixels cannot be undistorted")
     k1, k2, p1, p2, k3 = distortion
     matrix = np.array(K).reshape(3, 3)
     v, u = np.mgrid[0:height, 0:width] + 0.5
     x, y, _ = np.linalg.inv(matrix) @ np.stack([u.ravel(), v.ravel(), np.ones(u.size)])
     r2 = x * x + y * y
     radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    bent = np.stack(
-        [
-            x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
-            y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
-            np.ones_like(x),
-        ]
-    )
-    source = matrix[:2] @ bent - 0.5
-    column = np.clip(source[0], 0, width - 1)
-    row = np.clip(source[1], 0, height - 1)
-    left, above = np.minimum(column.astype(int), width - 2), np.minimum(row.astype(int), height - 2)
-    fractions = ((row - above)[:, None].astype(np.float32), (column - left)[:, None].astype(np.float32))
-    held = (source[0] >= -0.5) & (source[0] <= width - 0.5) & (r2 < _fold(k1, k2, k3))
-    held &= (source[1] >= -0.5) & (source[1] <= height - 0.5)
-    return above, left, *fractions, held
+    bent = [
+        x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
+        y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
+        np.ones_like(x),
+    ]
+    u, v = matrix[:2] @ bent - 0.5
+    held = (u >= -0.5) & (u <= width - 0.5) & (v >= -0.5) & (v <= height - 0.5) & (r2 < _fold(k1, k2, k3))
+    return u, v, held
 
 
 def _modified(path: Path) -> int | None:
@@ -393,18 +399,9 @@ def _through(image: Float32, lens: PhotoLens, K: Float, size: tuple[int, int]) -
     height, width = image.shape[:2]
     times = _samples(lens, width, K)
     pixels, _ = _lens_lookup(lens, tuple(K.ravel()), size, times)
-    u = pixels[:, 0] * (width / lens.size[0]) - 0.5
-    v = np.clip(pixels[:, 1] * (height / lens.size[1]) - 0.5, 0, height - 1)
-    around = lens.model == "EQUIRECTANGULAR"
-    u = u if around else np.clip(u, 0, width - 1)
-    left, above = np.floor(u).astype(int), np.floor(v).astype(int)
-    right, down = (u - left)[:, None].astype(np.float32), (v - above)[:, None].astype(np.float32)
-    columns = [left % width, (left + 1) % width] if around else [left, np.minimum(left + 1, width - 1)]
-    below = np.minimum(above + 1, height - 1)
-    top = image[above, columns[0]] * (1 - right) + image[above, columns[1]] * right
-    bottom = image[below, columns[0]] * (1 - right) + image[below, columns[1]] * right
-    shape = (size[1] * times, size[0] * times, image.shape[2])
-    return resized((top * (1 - down) + bottom * down).reshape(shape), size)
+    u, v = (pixels * (np.array([width, height]) / lens.size) - 0.5).T
+    samples = _sampled(image, u, v, around=lens.model == "EQUIRECTANGULAR")
+    return resized(samples.reshape(size[1] * times, size[0] * times, -1), size)
 
 
 _MOST_SAMPLES = 8

@@ -48,10 +48,8 @@ class Stream(PointStream):
             notes = (Note("header_count", count, text),) if reader.recovered else ()
             system = _system(header)
 
-        def sampled(color: Names) -> MarkedPoints:
-            parts = [_points(run, color) for run in runs] or [_NOTHING]
-            positions, values, noise = (np.concatenate(column) for column in zip(*parts, strict=True))
-            return positions, values, noise
+        def sampled(color: Names) -> list[MarkedPoints]:
+            return [_points(run, color) for run in runs] or [_NOTHING]
 
         self._color, sample = telling(choices, sampled)
         super().__init__(path, count, sample, judge.full_scales(np.dtype(np.uint16)), notes=notes)
@@ -126,15 +124,21 @@ def _opened(path: Path) -> Iterator[Any]:
         raise InputError(f"cannot be read as LAS: {str(error) or type(error).__name__}", path=path) from error
 
 
+def _number(path: Path, at: int, kind: str) -> Any:
+    """Return the value of a type of `struct` at a byte; bytes past the end of the file are 0."""
+    size = struct.calcsize(kind)
+    with path.open("rb") as file:
+        file.seek(at)
+        return struct.unpack(kind, file.read(size).ljust(size, b"\0"))[0]
+
+
 def _recovered(path: Path, header: Any) -> bool:
     """Set a count of points of 0 to the number that follow, and return whether there are any."""
     if header.point_count:
         return False
-    with path.open("rb") as file:
-        head = file.read(247).ljust(247, b"\0")
-    (legacy,), (extended,) = struct.unpack_from("<I", head, 107), struct.unpack_from("<Q", head, 235)
+    minor, legacy, extended = (_number(path, *at) for at in ((25, "<B"), (107, "<I"), (235, "<Q")))
     end = path.stat().st_size
-    if head[25] >= 4 and header.offset_to_point_data < extended < end:
+    if minor >= 4 and header.offset_to_point_data < extended < end:
         end = extended
     room = max(0, end - header.offset_to_point_data)
     if header.are_points_compressed:
@@ -148,12 +152,10 @@ def _recovered(path: Path, header: Any) -> bool:
 
 def _check_records(path: Path) -> None:
     """Check the number of variable-length records against the file's size, since laspy tries to read all."""
-    with path.open("rb") as file:
-        head = file.read(375).ljust(375, b"\0")
-    if head[:4] != b"LASF":
-        raise InputError(f"cannot be read as LAS (begins with {head[:4]!r})", path=path)
-    points_at, records = struct.unpack_from("<II", head, 96)
-    (extended,) = struct.unpack_from("<I", head, 243) if head[25] >= 4 else (0,)
+    if (begin := _number(path, 0, "4s")) != b"LASF":
+        raise InputError(f"cannot be read as LAS (begins with {begin!r})", path=path)
+    points_at, records = _number(path, 96, "<I"), _number(path, 100, "<I")
+    extended = _number(path, 243, "<I") if _number(path, 25, "<B") >= 4 else 0
     size = path.stat().st_size
     if points_at > size:
         raise damaged(f"truncated: points begin at byte {points_at:,} of {size:,}", path=path)
@@ -168,17 +170,12 @@ def _check_count(path: Path, there: int, promised: int) -> None:
 
 def _check_chunk_table(path: Path, points_at: int, promised: int) -> None:
     """Check the number of chunks against points and bytes, since lazrs aborts when out of memory."""
-    with path.open("rb") as file:
-        file.seek(points_at)
-        (table,) = struct.unpack("<q", file.read(8).ljust(8, b"\0"))
-        size = file.seek(0, 2)
-        if table == -1:  # streamed file: the offset is at its end
-            file.seek(-8, 2)
-            (table,) = struct.unpack("<q", file.read(8).ljust(8, b"\0"))
-        if not points_at < table <= size - 8:
-            raise damaged("truncated: the chunk table is cut off", path=path)
-        file.seek(table)
-        _version, chunks = struct.unpack("<II", file.read(8).ljust(8, b"\0"))
+    table, size = _number(path, points_at, "<q"), path.stat().st_size
+    if table == -1:  # streamed file: the offset is at its end
+        table = _number(path, size - 8, "<q")
+    if not points_at < table <= size - 8:
+        raise damaged("truncated: the chunk table is cut off", path=path)
+    chunks = _number(path, table + 4, "<I")
     if chunks > max(promised, 1):
         raise damaged(f"broken chunk table: {chunks:,} chunks for {promised:,} points", path=path)
     if chunks > table - points_at:

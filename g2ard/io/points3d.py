@@ -1,6 +1,5 @@
 """Reader for COLMAP's sparse points as a coloured point cloud."""
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -8,14 +7,14 @@ import numpy as np
 from g2ard.errors import InputError, damaged
 from g2ard.io.colmap import Columns, Table, TextTable, model_folder, parsing, points_file
 from g2ard.io.jsonfile import Place
-from g2ard.io.stream import MarkedPoints, PointStream
+from g2ard.io.stream import HeldPoints
 from g2ard.io.types import Bytes, Float
 
 _POINT = Columns.of("QdddBBBdQ", "POINT3D_ID", *"XYZRGB", "ERROR", "TRACK")
 _NUMBERS = Columns.of("ddddddd", "POINT3D_ID", *"XYZRGB")
 
 
-class Stream(PointStream):
+class Stream(HeldPoints):
     """The points3D.bin or .txt itself, or that of the model in a COLMAP folder, in memory."""
 
     def __init__(self, path: Path) -> None:
@@ -25,18 +24,10 @@ class Stream(PointStream):
                 raise InputError("has no points3D.bin or points3D.txt", path=model_folder(path) or path)
             path = file
         with parsing(path):
-            self._positions, rgb = (_binary if path.suffix.lower() == ".bin" else _text)(path)
-        self._colors = rgb.astype(np.float32)
-        whole = (self._colors == np.rint(self._colors)).all()
-        sample = self._positions, self._colors, np.zeros(len(rgb), bool)
-        super().__init__(path, len(rgb), sample, (255.0,) if whole else (1.0, 255.0))
+            positions, rgb = (_binary if path.suffix.lower() == ".bin" else _text)(path)
+        whole = (rgb == np.rint(rgb)).all()
+        super().__init__(path, positions, rgb, (255.0,) if whole else (1.0, 255.0))
         self.axes = self.axes or "RDF"
-
-    def raw(self, rows: int, start: int) -> Iterator[MarkedPoints]:
-        for first in range(start, self.count, rows):
-            part = slice(first, first + rows)
-            colors = self._colors[part]
-            yield self._positions[part], colors, np.zeros(len(colors), bool)
 
 
 def _binary(path: Path) -> tuple[Float, Bytes]:
@@ -55,17 +46,16 @@ def _binary(path: Path) -> tuple[Float, Bytes]:
 
 def _text(path: Path) -> tuple[Float, Float]:
     table = TextTable(path, "point")
-    rows = [table.words[1:7] for _ in table]
-    plain = all(word.isascii() and "_" not in word for words in rows for word in words)  # float() reads both
+    lines = [" ".join(table.words[1:7]) for _ in table]
     try:
-        values = np.array(rows, np.float64).reshape(len(rows), 6)
-    except ValueError:
-        plain = False
-    if not plain:  # find the wrong number
+        values = np.loadtxt(lines, ndmin=2).reshape(len(lines), 6)
+    except ValueError:  # find the wrong number
         table = TextTable(path, "point")
         values = np.array([table.take(_NUMBERS)[1:] for _ in table])
     inside = (values[:, 3:] >= 0) & (values[:, 3:] <= 255)
     if not inside.all():
         i, channel = (int(at) for at in np.argwhere(~inside)[0])
-        raise Place(path, i, "point", "RGB"[channel]).error(f"is {rows[i][3 + channel]!r}, expected 0 to 255")
+        raise Place(path, i, "point", "RGB"[channel]).error(
+            f"is {values[i, 3 + channel]:g}, expected 0 to 255"
+        )
     return values[:, :3], values[:, 3:]

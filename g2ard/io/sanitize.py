@@ -132,7 +132,7 @@ class Tally:
 
     def _clean(self, raw: Raw) -> Mask:
         logits, scales, quats = raw.logit_opacities, raw.log_scales, raw.quats
-        good = ~np.isnan(logits) & ~(np.isnan(scales) | (scales == np.inf)).any(1)
+        good: Mask = ~np.isnan(logits) & ~(np.isnan(scales) | (scales == np.inf)).any(1)
         for values in (raw.means, quats, raw.sh0, raw.shN):
             good &= _finite_rows(values)
 
@@ -200,4 +200,4 @@ def logits_of(alphas: Values) -> Values:
 def _finite_rows(values: Values) -> Mask:
     flat = values.reshape(len(values), -1)
     finite = np.isfinite(flat)
-    return np.ones(len(flat), bool) if finite.all() else finite.all(1)
+    return np.ones(len(flat), bool) if finite.all() else np.all(finite, axis=1)

@@ -16,7 +16,7 @@ from g2ard.errors import InputError
 from g2ard.io import judge
 from g2ard.io.paths import file_identity
 from g2ard.io.sanitize import BLOCK, Raw, Tally
-from g2ard.io.types import Cloud, Float, Float32, Mask, Note, Points
+from g2ard.io.types import Cloud, Float, Float32, Mask, Note, Points, Values
 from g2ard.progress import plural
 from g2ard.scene.splats import ARRAYS, Splats
 from g2ard.scene.transform import change_of_axes, common_axes, one_model, restored, stand_as
@@ -328,6 +328,20 @@ class PointStream(Stream[RawPoints]):
         return Cloud(Points(positions[:kept], colors), notes, colored, self.axes)
 
 
+class HeldPoints(PointStream):
+    """Point cloud in memory, of which nothing is marked as noise."""
+
+    def __init__(self, path: Path, positions: Float, values: Values, scales: Sequence[float]) -> None:
+        self._held = positions, values.astype(np.float32), np.zeros(len(positions), bool)
+        super().__init__(path, len(positions), self._held, scales)
+
+    def raw(self, rows: int, start: int) -> Iterator[MarkedPoints]:
+        positions, values, noise = self._held
+        for first in range(start, self.count, rows):
+            part = slice(first, first + rows)
+            yield positions[part], values[part], noise[part]
+
+
 _DEGREES = Note(
     "degrees",
     1,
@@ -442,9 +456,18 @@ def _far_apart(streams: Sequence[PointStream]) -> Iterator[Note]:
             return
 
 
-def telling(choices: Iterable[Names], read: Callable[[Names], MarkedPoints]) -> tuple[Names, MarkedPoints]:
-    """Return the first of several names of colours whose sample is not black, or constant, and the sample."""
-    found = [(names, read(names)) for names in choices] or [((), read(()))]
+def telling(
+    choices: Sequence[Names], read: Callable[[Names], Iterable[MarkedPoints]]
+) -> tuple[Names, MarkedPoints]:
+    """Return the first of several names of colours whose sample is not black, or constant, and the sample.
+
+    Args:
+        read: returns the parts of the sample, of which there is at least one.
+    """
+    found = list[tuple[Names, MarkedPoints]]()
+    for names in choices or [()]:
+        positions, values, noise = (np.concatenate(column) for column in zip(*read(names), strict=True))
+        found.append((names, (positions, values, noise)))
     return next((each for each in found if judge.tells(each[1][1][~each[1][2]])), found[0])
 
 
