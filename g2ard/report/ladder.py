@@ -18,8 +18,8 @@ from g2ard.report.page import Page, Shown
 from g2ard.scene.splats import Splats
 from g2ard.stages.evaluate import Evaluation, ViewScore, evaluate
 
-_SOFT_PSNR = 32.0
-"""PSNR against the dense scene, dB, below which surfaces look soft."""
+_VISIBLE = 1.0
+"""Loss of detail against the dense scene that is just noticeable, see `metrics.lost_detail`."""
 _EQUAL_LOSS = 1.0
 """Loss in dB against the best result that is tolerated where targets are photos, which no scene reaches."""
 
@@ -42,8 +42,11 @@ class Rung:
 
     @property
     def worst(self) -> ViewScore:
-        """Score of its worst view."""
-        return min(self.scores.views, key=lambda view: view.psnr)
+        """Score of its worst view: by detail against renders, by PSNR against photos."""
+        views = self.scores.views
+        if any(view.against == "photo" for view in views):
+            return min(views, key=lambda view: view.psnr)
+        return max(views, key=lambda view: view.lost)
 
 
 @dataclass(frozen=True)
@@ -77,29 +80,28 @@ def _short(count: int) -> str:
 def recommendation(rungs: Sequence[Rung]) -> str:
     """Return one sentence on the smallest result that suffices; `rungs` are sorted by size, smallest first.
 
-    Against renders of the dense scene no view may fall below 32 dB. Against photos the mean may be 1 dB below
-    the best.
+    Against renders of the dense scene no view may lose detail visibly. Against photos the mean may be 1 dB
+    below the best.
     """
     by_photos = any(view.against == "photo" for view in rungs[0].scores.views)
     best = max(rung.scores.psnr for rung in rungs)
     enough = [
         rung
         for rung in rungs
-        if (rung.scores.psnr >= best - _EQUAL_LOSS if by_photos else rung.worst.psnr >= _SOFT_PSNR)
+        if (rung.scores.psnr >= best - _EQUAL_LOSS if by_photos else rung.worst.lost < _VISIBLE)
     ]
     if not enough:
         largest = rungs[-1]
         return (
-            f"every size loses visibly: {largest.label} has {largest.worst.psnr:.1f} dB in its worst view, "
-            f"and below {_SOFT_PSNR:.0f} dB surfaces look soft; keep more Gaussians"
+            f"every size loses detail visibly, {largest.label} most in {largest.worst.name}; "
+            "keep more Gaussians, or recover them with distill"
         )
     found = enough[0]
     if by_photos:
         text = f"{found.label} is the smallest within {_EQUAL_LOSS:.0f} dB of the best: "
         text += f"{found.scores.psnr:.1f} dB against the photos"
     else:
-        text = f"{found.label} is the smallest without a visible loss: "
-        text += f"worst view {found.worst.psnr:.1f} dB"
+        text = f"{found.label} is the smallest without a visible loss of detail"
     return text + ("; fewer Gaussians may do" if found is rungs[0] else "")
 
 
@@ -129,7 +131,10 @@ def ladder(
     page.html(f'<div class="row"><figure>{_plot(rungs)}</figure></div>')
     page.html(legend(["mean", "worst view"]))
     page.table(_COLUMNS, _rows(rungs, dense))
-    page.paragraph(f"Scored in {rungs[0].scores.scored_in}.")
+    page.paragraph(
+        f"Scored in {rungs[0].scores.scored_in}. Detail lost: contrast that the worst regions "
+        f"of a view lack; people see it from {_VISIBLE:.0f} on."
+    )
     renderers = [Renderer(rung.splats, background=background, settings=settings) for rung in rungs]
     score = partial(evaluate, targets=best, background=background, settings=settings)
 
@@ -150,11 +155,11 @@ def ladder(
     page.write(path, overwrite)
 
 
-_COLUMNS = ("scene", "size", "Gaussians", "MB", "PSNR, dB", "worst view", "SSIM")
+_COLUMNS = ("scene", "size", "Gaussians", "MB", "PSNR, dB", "worst view", "detail lost", "SSIM")
 
 
 def _rows(rungs: Sequence[Rung], dense: Dense | None) -> list[list[str]]:
-    top = [] if dense is None else [[dense.name, "1×", f"{dense.count:,}", _mb(dense.bytes), "", "", ""]]
+    top = [] if dense is None else [[dense.name, "1×", f"{dense.count:,}", _mb(dense.bytes), *[""] * 4]]
     return top + [
         [
             rung.name,
@@ -163,6 +168,7 @@ def _rows(rungs: Sequence[Rung], dense: Dense | None) -> list[list[str]]:
             _mb(rung.bytes),
             f"{rung.scores.psnr:.2f}",
             f"{rung.worst.name} {rung.worst.psnr:.2f}",
+            f"{rung.worst.lost:.2f}",
             f"{rung.scores.ssim:.4f}",
         ]
         for rung in reversed(rungs)

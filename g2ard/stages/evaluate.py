@@ -16,7 +16,7 @@ from g2ard.io.images import as_saved
 from g2ard.io.reports import Report
 from g2ard.progress import Progress, plural, silent
 from g2ard.rendering.exposure import rendered
-from g2ard.rendering.metrics import Lpips, detail, edge_psnr, psnr, ssim
+from g2ard.rendering.metrics import Lpips, detail, edge_psnr, lost_detail, psnr, ssim
 from g2ard.rendering.renderer import RasterSettings, Renderer
 from g2ard.rendering.targets import Targets, against_of, checked_targets, fill, mask_of, scored_in
 from g2ard.scene.cameras import USUAL
@@ -27,7 +27,7 @@ from g2ard.system.threads import in_threads
 @dataclass(frozen=True)
 class ViewScore:
     """Scores of one view: PSNR and that of gradients in dB, SSIM and the correlation of gradients in [−1, 1],
-    LPIPS by network (empty without weights); NaN where not measured.
+    LPIPS by network (empty without weights), visibility of lost detail; NaN where not measured.
 
     `against` is "photo" or "teacher" if the targets say so, `kind` the kind of view (`Cameras.kinds`),
     `size` the width and height of the images in pixels.
@@ -42,6 +42,7 @@ class ViewScore:
     against: str | None = None
     kind: str = USUAL
     size: tuple[int, int] = (0, 0)
+    lost: float = math.nan
 
 
 @dataclass(frozen=True)
@@ -124,6 +125,7 @@ class Evaluation(Report):
                     "ssim": v.ssim,
                     "edge_psnr": v.edge_psnr,
                     "detail": v.detail,
+                    "lost": v.lost,
                 }
                 | ({"against": v.against} if v.against else {})
                 | ({"kind": v.kind} if v.kind != USUAL else {})
@@ -148,7 +150,8 @@ def evaluate(
 
     PSNR = −10·log₁₀ of the mean squared difference over pixels and channels, in dB, at most 100; SSIM (Wang
     et al. 2004) has an 11×11 Gaussian window, σ 1.5, zero-padded, values in 0–1; the PSNR of gradients is
-    that of differences between neighbouring pixels, and detail their correlation, for thin structures.
+    that of differences between neighbouring pixels, and detail their correlation, for thin structures. `lost`
+    of a view is the visibility of the detail that its worst regions lack: above 1 people see the loss.
     Renders are clamped to [0, 1] without 8-bit rounding, unless `eight_bit` is set. If a photo has a mask,
     only masked pixels count.
 
@@ -203,6 +206,7 @@ def evaluate(
             against_of(targets, view),
             cameras.kinds[view],
             (int(cameras.widths[view]), int(cameras.heights[view])),
+            lost_detail(image, target, mask),
         )
 
     scores: list[ViewScore] = []

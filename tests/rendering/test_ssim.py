@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from g2ard import _core
 from g2ard.config.choices import BLACK
 from g2ard.errors import InputError
-from g2ard.rendering.metrics import detail, edge_psnr, psnr, ssim
+from g2ard.rendering.metrics import detail, edge_psnr, lost_detail, psnr, ssim
 from g2ard.rendering.renderer import Renderer
 from g2ard.scene.cameras import Cameras
 from g2ard.stages.recover.losses import l1_ssim
@@ -234,3 +234,21 @@ def test_shapes_must_fit() -> None:
         _core.psnr(a[:0], a[:0])
     with pytest.raises(InputError, match=r"target: expected \(H, W, C\) float32"):
         l1_ssim(torch.zeros(4, 5, 3), torch.zeros(4, 5, 3, dtype=torch.float64))
+
+
+def test_detail_counts_as_lost_where_people_see_it() -> None:
+    rng = np.random.default_rng(0)
+    flat = np.full((96, 96, 3), 0.5)
+    grain = np.where((np.indices((96, 96)).sum(0) // 2) % 2, 1.0, -1.0)[..., None]
+    textured, faint = flat + 0.05 * grain, flat + 0.001 * grain
+    noisy = textured + rng.normal(0, 0.05, textured.shape)
+    hole, mask = textured.copy(), np.ones((96, 96), bool)
+    hole[32:64, 32:64] = 0.5
+    mask[30:66, 30:66] = False
+    assert lost_detail(flat, textured) > 2
+    assert lost_detail(hole, textured) > 2  # one region of nine
+    assert lost_detail(hole, textured, mask) == 0
+    assert lost_detail(flat, faint) == 0  # nobody sees it
+    assert lost_detail(textured + 0.02, textured) < 0.3  # brighter
+    assert lost_detail(noisy, textured) < 0.3
+    assert 0 < lost_detail(flat + 0.04 * grain, textured) < 1 < lost_detail(flat + 0.01 * grain, textured)

@@ -12,31 +12,35 @@ from g2ard.report.ladder import Rung, recommendation
 from g2ard.stages.evaluate import Evaluation, ViewScore
 from helpers.commands import CommandLine, refused, succeeds
 from helpers.photos import photographed
+from helpers.realdata import real
 from helpers.scenes import around, checkered_ball
 from helpers.studies import check_page
 
 BALL = checkered_ball(300)
 
 
-def rungs(*psnr: tuple[float, float], against: str = "teacher") -> list[Rung]:
-    """Return results with the PSNR of two views each, smallest first: 40×, 20×, 10×, …"""
+def rungs(*scores: tuple[float, float], against: str = "teacher") -> list[Rung]:
+    """Return results with the scores of two views each, smallest first: 40×, 20×, 10×, …
+
+    The scores are PSNR against photos, the visibility of lost detail otherwise.
+    """
     found = []
-    for i, (first, second) in enumerate(psnr):
-        views = tuple(ViewScore(name, v, against=against) for name, v in (("a", first), ("b", second)))
-        scores = Evaluation(10 * 2**i, 1, views, "2 views")
-        found.append(Rung(f"{i}.ply", f"{40 / 2**i:g}×", 100 * 2**i, BALL, scores))
+    for i, pair in enumerate(scores):
+        views = tuple(
+            ViewScore(name, v, against=against) if against == "photo" else ViewScore(name, 40 - v, lost=v)
+            for name, v in zip("ab", pair, strict=True)
+        )
+        result = Evaluation(10 * 2**i, 1, views, "2 views")
+        found.append(Rung(f"{i}.ply", f"{40 / 2**i:g}×", 100 * 2**i, BALL, result))
     return found
 
 
 @pytest.mark.parametrize(
     ("given", "told"),
     [
-        (
-            rungs((40, 30), (42, 33), (44, 36)),
-            "20× is the smallest without a visible loss: worst view 33.0 dB",
-        ),
-        (rungs((40, 34), (42, 36)), "40× is .* worst view 34.0 dB; fewer Gaussians may do"),
-        (rungs((33, 28), (35, 31.2)), "every size loses visibly: 20× has 31.2 dB .*; keep more Gaussians"),
+        (rungs((0.2, 1.2), (0.1, 0.9), (0, 0.1)), "20× is the smallest without a visible loss of detail"),
+        (rungs((0.3, 0.9), (0.1, 0.2)), "40× is the smallest .*; fewer Gaussians may do"),
+        (rungs((2, 3), (1.1, 0.8)), "every size loses detail visibly, 20× most in a; keep more .*"),
         (
             rungs((24, 20), (27.5, 24.5), (28, 25), against="photo"),
             "20× is the smallest within 1 dB of the best: 26.0 dB against the photos",
@@ -45,6 +49,26 @@ def rungs(*psnr: tuple[float, float], against: str = "teacher") -> list[Rung]:
 )
 def test_the_smallest_size_that_suffices_is_recommended(given: list[Rung], told: str) -> None:
     assert re.fullmatch(told, recommendation(given))
+
+
+@pytest.mark.parametrize(
+    ("name", "shown", "ratio", "seen"),
+    [
+        ("format_samples/guitar.compressed.ply", (2, 4), 8, True),
+        ("format_samples/guitar.compressed.ply", (2, 4), 1.1, False),
+        ("format_samples/guitar.compressed.ply", (2, 4), 1, False),
+        ("playbot/0_0", (6,), 30, True),
+    ],
+)
+def test_people_see_lost_grain_but_no_copy(
+    name: str, shown: tuple[int, ...], ratio: float, seen: bool, tmp_path: Path
+) -> None:
+    scene = g2ard.load(real(name))
+    targets = g2ard.TeacherRenders(scene, g2ard.make_pool(scene, 16, size=(800, 600)).take(shown))
+    g2ard.save(tmp_path / "copy.spz", scene)
+    few = g2ard.load(tmp_path / "copy.spz") if ratio == 1 else g2ard.simplify(scene, ratio=ratio, blind=True)
+    worst = max(view.lost for view in g2ard.evaluate(few, targets).views)
+    assert worst > 1 if seen else worst < 0.2
 
 
 @pytest.fixture
@@ -78,8 +102,10 @@ def test_evaluate_writes_a_page_on_several_sizes(
     assert result["advice"][1:] in html
     assert html.count("<circle") == 4  # mean and worst view of both sizes
     labels = ("150", "10") if against == "photos" else ("2×", "30×")
-    worst = [min(row["views"], key=lambda view: view["psnr"]) for row in result["scenes"]]
-    for row, label, view in zip(result["scenes"], labels, worst, strict=True):
+    sign, score = (-1, "psnr") if against == "photos" else (1, "lost")
+    shown = [row["own_size"] or row for row in result["scenes"]]
+    worst = [max(row["views"], key=lambda view: sign * view[score]) for row in shown]
+    for row, label, view in zip(shown, labels, worst, strict=True):
         for cell in (label, f"{row['psnr']:.2f}", f"{view['name']} {view['psnr']:.2f}"):
             assert f">{cell}</td>" in html
         assert re.search(rf"<h4>{re.escape(view['name'])}, worst of [^<]*{label}", html)

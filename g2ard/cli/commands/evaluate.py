@@ -138,7 +138,7 @@ def evaluate(
     cameras = targets.cameras
     networks = load_lpips(lpips, scaled=lpips_input == "scaled") if lpips else None
     rows: list[dict[str, Any]] = []
-    found = []
+    found, judged = [], []
     loaded: list[Splats] = []
     for path, source in zip(scenes, sources, strict=True):
         splats = run.load(source)
@@ -155,7 +155,9 @@ def evaluate(
             progress=run.progress,
         )
         scored = alike(targets, stage=path.name)
+        at_own_size = unshrunk and alike(unshrunk, stage=f"{path.name} unshrunk")
         found.append(scored)
+        judged.append(at_own_size or scored)
         if output is not None:
             loaded.append(splats)
         drift = None if frozen is None else _drift(frozen, splats, path)
@@ -163,7 +165,7 @@ def evaluate(
             {
                 "scene": str(path),
                 **scored.as_dict(),
-                "own_size": unshrunk and alike(unshrunk, stage=f"{path.name} unshrunk").means.as_dict(),
+                "own_size": at_own_size and at_own_size.as_dict(),
                 "drift95": drift,
                 "needle": needle_share(splats.scales),
                 "file_bytes": bytes_of(path),
@@ -181,9 +183,11 @@ def evaluate(
         run.say(better)
     advice = None
     if output is not None:
-        results = zip(scenes, loaded, found, strict=True)
+        results = zip(scenes, loaded, judged, strict=True)
         with run.showing("--output"):
-            advice = _write_ladder(run, output, list(results), targets, teaching, found_views, settings)
+            advice = _write_ladder(
+                run, output, list(results), unshrunk or targets, teaching, found_views, settings
+            )
     counts = Counter(view["against"] for view in rows[0]["views"])
     single = {"photo": "photos", "teacher": "teacher"}
     against = counts if len(counts) > 1 else single[next(iter(counts))]
