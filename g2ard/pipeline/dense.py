@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g2ard.config.choices import BLACK, Colour
+from g2ard.errors import InputError
 from g2ard.io.stream import PartsStream
 from g2ard.progress import Progress, silent
 from g2ard.rendering.targets import Targets, TeacherRenders
@@ -152,6 +153,15 @@ class _Remembering:
         if self.first is None:
             self.first = arrays, seen
         return seen
+
+
+def as_dense(prior: Splats | Dense) -> Dense:
+    """Return a dense scene: the given one, or one in memory of Gaussians."""
+    if isinstance(prior, Splats):
+        return InMemory(prior.narrowed())
+    if not hasattr(type(prior), "merged"):
+        raise InputError(f"expected Splats or tiles, got {type(prior).__name__}", parameter="prior")
+    return prior
 
 
 def whole(scene: Splats | PartsStream) -> Splats:

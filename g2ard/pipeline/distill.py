@@ -14,13 +14,13 @@ from numpy.typing import ArrayLike, NDArray
 from g2ard.config.checks import checks_arguments
 from g2ard.io.types import ViewSet
 from g2ard.pipeline.config import DistillConfig, SelectConfig
-from g2ard.pipeline.dense import Dense, InMemory, whole
+from g2ard.pipeline.dense import Dense, InMemory, as_dense, whole
 from g2ard.pipeline.steps import Steps
 from g2ard.progress import Progress, plural, silent
 from g2ard.rendering.targets import Exposed, Photos, PhotosOrRenders, Subset, Targets, checked_targets
 from g2ard.report.run import DistillReport, RoundReport, StageSeconds, ViewsReport
 from g2ard.scene.cameras import Cameras
-from g2ard.scene.splats import Splats, scene_of
+from g2ard.scene.splats import Splats
 from g2ard.stages.recover.config import RecoverConfig
 from g2ard.stages.recover.loop import checked_weights
 from g2ard.stages.recover.optimize import Watch
@@ -135,7 +135,7 @@ def distill(
         KeyboardInterrupt: after Ctrl-C; the same call resumes from `work`.
     """
     config, targets = config or DistillConfig(), checked_targets(targets)
-    dense: Dense = prior if hasattr(type(prior), "merged") else InMemory(scene_of(prior, "prior").narrowed())
+    dense = as_dense(prior)
     if validation is not None:
         validation = checked_targets(validation, "validation")
     schedule, counts, steps = config.recover.schedule, [budget], Steps(work, progress)
