@@ -91,7 +91,8 @@ def told(report: RunReport, *, verbose: bool = False) -> list[str]:
     from g2ard.stages.simplify.gaps import RECOVERED_GAPS, gaps_line
 
     rounds = [entry.recover for entry in report.rounds]
-    lines = [outcome(one) for entry in rounds for one in entry]
+    lines = _own_size(report)
+    lines += [outcome(one) for entry in rounds for one in entry]
     lines += [cut_short(one) for entry in rounds[-1:] for one in entry[-1:]]
     lines += [str(one.exposure) for entry in rounds for one in entry[-1:] if one.exposure]
     lines += [unregularized(rounds)] if verbose else []
@@ -104,18 +105,24 @@ def told(report: RunReport, *, verbose: bool = False) -> list[str]:
     if report.packed:
         size, unpacked = report.bytes["file"] or 0, report.scores["recovered"].psnr
         lines += score_lines(report.packed, size, unpacked, report.size)
-    if report.own_size:
-        before, after = (report.own_size[name] for name in ("simplified", "recovered"))
-        lines.append(
-            f"at the views' own size ({after.scored_in}): {before.psnr:.2f} → {after.psnr:.2f} dB, "
-            f"SSIM {before.ssim:.4f} → {after.ssim:.4f}"
-        )
-        if (lost := report.scores["recovered"].psnr - after.psnr) > _HARMFUL_SIZE:
-            lines.append(
-                f"warning: the result is {lost:.1f} dB worse at the views' own size than at --size; "
-                "leave --size out, or give a larger one"
-            )
     return [line for line in lines if line is not None]
+
+
+def _own_size(report: RunReport) -> list[str | None]:
+    """Return the scores at the views' own size, if they were measured, and whether --size did harm."""
+    if not report.own_size:
+        return []
+    before, after = (report.own_size[name] for name in ("simplified", "recovered"))
+    lines: list[str | None] = [
+        f"at the views' own size ({after.scored_in}): {before.psnr:.2f} → {after.psnr:.2f} dB, "
+        f"SSIM {before.ssim:.4f} → {after.ssim:.4f}"
+    ]
+    if (lost := report.scores["recovered"].psnr - after.psnr) > _HARMFUL_SIZE:
+        lines.append(
+            f"warning: the result is {lost:.1f} dB worse at the views' own size than at --size; "
+            "leave --size out, or give a larger one"
+        )
+    return lines
 
 
 def loss(

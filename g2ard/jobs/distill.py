@@ -40,7 +40,7 @@ from g2ard.pipeline.distill import distill as pipeline
 from g2ard.poses import best_views
 from g2ard.progress import Detail, Progress, Say, plural, silent, unsaid
 from g2ard.rendering.metrics import psnr
-from g2ard.rendering.targets import Subset, Targets, fill, kinds_of, kinds_told
+from g2ard.rendering.targets import Subset, Targets, fill, kinds_of, kinds_told, scored_in
 from g2ard.rendering.visibility import overdraw
 from g2ard.report.run import Packed, RunReport, by_kind
 from g2ard.scene.cameras import USUAL, Cameras
@@ -205,6 +205,15 @@ class DistillJob:
         done = self._reduced(self.dense, self.budget.count, work, time_left=limited)
         splats = self.budget.shrink(done.splats, self.say)
         return replace(done, splats=splats, held_out=done.scored_on(self.targets.held_out))
+
+    def scored(self, done: Distilled) -> Distilled:
+        """Return a result with its scores in held-out views, at their own size."""
+        targets = done.scored_on(self.targets.full or self.targets.held_out)
+        if not len(targets.cameras):
+            return done
+        background = self.config.recover.background
+        found = evaluate(done.splats, targets, background=background, progress=self.progress, stage="scoring")
+        return replace(done, scores=replace(found, scored_in=scored_in(targets, "held-out")))
 
     def time_left(self, limit: float) -> float:
         """Return the seconds for recovery, of a limit for the whole run, after all that comes before it.
@@ -518,7 +527,7 @@ def distill(
     done = job.run(work)
     if judgement := job.budget.judge(done.splats):
         say(judgement[1])
-    return done
+    return job.scored(done)
 
 
 @contextmanager

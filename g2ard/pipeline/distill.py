@@ -21,6 +21,7 @@ from g2ard.rendering.targets import Exposed, Photos, PhotosOrRenders, Subset, Ta
 from g2ard.report.run import DistillReport, RoundReport, StageSeconds, ViewsReport
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats
+from g2ard.stages.evaluate import Evaluation
 from g2ard.stages.recover.config import RecoverConfig
 from g2ard.stages.recover.loop import checked_weights
 from g2ard.stages.recover.optimize import Watch
@@ -75,16 +76,20 @@ class Distilled(Shown):
             reference of Drift95.
         report: views, rounds and times.
         held_out: held-out targets for scoring; None if the caller has their own.
+        scores: of `splats` in held-out views at their own size; None without such views.
     """
 
     splats: Splats
     simplified: Splats
     report: DistillReport
     held_out: Targets | None = None
+    scores: Evaluation | None = None
 
     def __repr__(self) -> str:
         gain = self.report.rounds[-1].recover[-1:]
         scores = f", {gain[0].psnr}" if gain else ""
+        if self.scores is not None:
+            scores = f", PSNR {self.scores.psnr:.2f} dB in {self.scores.scored_in}"
         return f"Distilled({plural(len(self.splats), 'Gaussian')}{scores})"
 
     def scored_on(self, held_out: Targets) -> Targets:

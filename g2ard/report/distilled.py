@@ -78,11 +78,12 @@ def distill_report(
     if edges := edges_line(report.kinds):
         page.paragraph(edges)
     for line in told:
-        page.paragraph(line)
+        page.paragraph(line, warns=line.startswith("warning"))
     lost = _below_start(before, after)
     if lost:
         page.paragraph(f"Views that ended below their start: {', '.join(text for _, text in lost)}.")
     shown = list(dict.fromkeys([*(row for row, _ in lost[:1]), *_worst(after)]))[:_SHOWN]
+    shown.sort(key=lambda row: after[row].psnr)
     worst = [view for view in shown if after[view].name != best.cameras.names[0]]
     if worst:
         page.heading("Worst views")
@@ -114,21 +115,26 @@ def verdict(report: RunReport) -> str:
     >>> change = Change(30.0, 36.6)
     >>> kinds = [KindScore("near", 12, change, change, "near_0003", change, 0)]
     >>> made, size = "500 of 5,000 Gaussians", "800×600 px"
-    >>> verdict(SimpleNamespace(kinds=kinds, made=made, size=size, against="photos"))  # doctest: +ELLIPSIS
+    >>> report = SimpleNamespace(kinds=kinds, made=made, size=size, against="photos", own_size=None)
+    >>> verdict(report)  # doctest: +ELLIPSIS
     '500 of 5,000 Gaussians reproduce the photos at 36.6 dB, the mean of 12 held-out views of 800×600 px; ...'
     """
     kinds = report.kinds
+    what = "photos" if "photo" in report.against else DENSE
     if not kinds:
         return f"{plural(report.output_count, 'Gaussian')}; no held-out view shows the scene."
     weakest = min(kinds, key=lambda kind: kind.psnr.after)
     last = f"the worst view is {weakest.worst} ({weakest.worst_psnr.after:.1f} dB)"
     if len(kinds) > 1:
         last = f"{weakest.kind} views are weakest ({weakest.psnr.after:.1f} dB)"
-    what = "photos" if "photo" in report.against else DENSE
     views = sum(kind.views for kind in kinds)
     mean = sum(kind.views * kind.psnr.after for kind in kinds) / views
     over = f"the mean of {views} held-out views" if views > 1 else "in one held-out view"
-    return f"{report.made} reproduce the {what} at {mean:.1f} dB, {over} of {report.size}; {last}."
+    at = f"{mean:.1f} dB, {over} of {report.size}"
+    if report.own_size:
+        full = report.own_size["recovered"]
+        at = f"{full.psnr:.1f} dB in {full.scored_in}, the views' own size; at {at}"
+    return f"{report.made} reproduce the {what} at {at}; {last}."
 
 
 def _below_start(before: Sequence[ViewScore], after: Sequence[ViewScore]) -> list[tuple[int, str]]:

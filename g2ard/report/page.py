@@ -82,8 +82,9 @@ class Page:
     def heading(self, text: str, level: int = 2) -> None:
         self._parts.append(f"<h{level}>{escape(text)}</h{level}>")
 
-    def paragraph(self, text: str) -> None:
-        self._parts.append(f"<p>{escape(text)}</p>")
+    def paragraph(self, text: str, *, warns: bool = False) -> None:
+        kind = ' class="warns"' * warns
+        self._parts.append(f"<p{kind}>{escape(text)}</p>")
 
     def table(
         self, columns: Sequence[str], rows: Sequence[Sequence[str]], best: Collection[tuple[int, int]] = ()

@@ -47,6 +47,15 @@ def embedded(html: str) -> np.ndarray:
     return np.asarray(Image.open(BytesIO(base64.b64decode(data))))
 
 
+def test_a_result_shows_its_held_out_score_at_the_views_own_size(results: dict[str, Any]) -> None:
+    done = results["Distilled"]
+    views = VIEWS.take([VIEWS.names.index(name) for name in done.held_out.cameras.names])
+    known = g2ard.evaluate(done, g2ard.TeacherRenders(BALL, views)).psnr
+    width, height = VIEWS[0].width, VIEWS[0].height
+    held_out = f"PSNR {known:.2f} dB in 1 held-out view against the dense scene, {width}×{height} px"
+    assert repr(done) == f"Distilled(60 Gaussians, {held_out})"
+
+
 def test_results_show_a_line_and_a_picture(results: dict[str, Any]) -> None:
     for name, shown in results.items():
         line, html = repr(shown), shown._repr_html_()

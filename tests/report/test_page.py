@@ -7,7 +7,7 @@ from typing import Any
 
 from g2ard.report.distilled import _worst, verdict
 from g2ard.report.run import RunReport, by_kind
-from g2ard.stages.evaluate import ViewScore
+from g2ard.stages.evaluate import Means, ViewScore
 from helpers.commands import CommandLine, succeeds
 from helpers.studies import check_page, study
 
@@ -20,6 +20,11 @@ def test_distill_writes_a_report(command_line: CommandLine, tmp_path: Path) -> N
     check_page(html)
     assert re.search(r'<p class="lead">300 of 1,200 Gaussians reproduce the dense scene at \d+\.\d dB', html)
     assert html.index("<table>") < html.index("Worst views")
+    worst = [
+        float(found) for found in re.findall(r"<option[^>]*>result (\S+) dB", html[html.index("Worst") :])
+    ]
+    assert len(worst) == 3
+    assert worst == sorted(worst)
     assert "ball.ply" in html
 
 
@@ -48,3 +53,6 @@ def test_the_verdict_names_the_weakest_kind_of_view() -> None:
     assert verdict(replace(report, kinds=())) == "9 Gaussians; no held-out view shows the scene."
     of_photos = verdict(replace(report, lifted=True, against="photos"))
     assert of_photos.startswith("9 Gaussians from 90 points reproduce the photos at")
+    full = Means(26.04, 0.8, 30, 0.9, "5 photos, 96×72 px")
+    told = verdict(replace(report, own_size={"recovered": full}))
+    assert "at 26.0 dB in 5 photos, 96×72 px, the views' own size; at 29.8 dB, the mean of 5" in told
