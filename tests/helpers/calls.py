@@ -91,7 +91,8 @@ def options_of(name: str) -> dict[str, Any]:
 def flag_of(command: str, option: str) -> str:
     """Return the long flag of an option; of one that is on in its command's call, its opposite."""
     found = options_of(command)[option]
-    off = found.default is True and not {*found.secondary_opts} & {*CALLS[command].split()}
+    on = found.default is True or option == "weighted"  # weights count unless a preset says otherwise
+    off = on and not {*found.secondary_opts} & {*CALLS[command].split()}
     return max(found.secondary_opts if off else found.opts, key=len)
 
 
