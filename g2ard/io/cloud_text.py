@@ -31,6 +31,8 @@ _SHADES = ("red", "green", "blue"), ("intensity",)
 _TRIPLES = {6: (3,), 7: (4, 3), 8: (5, 4, 3), 9: (6, 3), 10: (7, 6, 4, 3)}
 """Number of columns without a heading → where colours may begin, the likeliest first."""
 
+_ALIKE = 0.5  # least correlation of the channels of colours that tells them from other columns
+
 _TYPES = {
     "F4": "<f4",
     "F8": "<f8",
@@ -132,14 +134,17 @@ def _unnamed(path: Path, table: Float) -> list[str]:
     if grid and (count > 6 or whole[5:] == [True]):
         return ["row", "column", *_unnamed(path, table[:, 2:])]  # of a scan's grid, as FARO writes them
     names = ["x", "y", "z", *(["intensity"] if count == 4 else [f"column_{k + 1}" for k in range(3, count)])]
-    found = list[tuple[bool, bool, int, int]]()
+    found, alike = list[tuple[bool, bool, int]](), dict[int, float]()
     for start in _TRIPLES.get(count, ()):
         values, top = table[:, start : start + 3], table[:, start : start + 3].max(initial=0)
         if values.min(initial=0) >= 0 and ((all(whole[start : start + 3]) and top <= 65535) or top <= 1):
             varying = bool(np.ptp(values, axis=0).all())
-            found.append((not varying, top > 255, len(found), start))
+            found.append((not varying, top > 255, start))
+            alike[start] = float(np.abs(np.corrcoef(values.T)).min()) if varying else 0.0
     if found:
-        start = min(found)[-1]
+        most = max(alike.values())  # of an intensity beside them, colours differ more than among each other
+        found = [each for each in found if alike[each[-1]] > most / 2 or most < _ALIKE]
+        start = min(found, key=lambda each: each[:2])[-1]
         names[start : start + 3] = ["red", "green", "blue"]
     elif count < 3 or count > 4:
         text = f"has {count} columns without a heading of x, y and z, none of them colours up to 1 or 255"

@@ -9,6 +9,7 @@ The draft asks for SPZ's own axes, which differ by half a turn about y.
 
 import base64
 import json
+import re
 import struct
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
@@ -42,9 +43,14 @@ from g2ard.scene.transform import (
 
 EXTENSION = "KHR_gaussian_splatting"
 SPZ_EXTENSION = f"{EXTENSION}_compression_spz_2"
-_SPZ_ALONE = "KHR_spz_gaussian_splats_compression"
-_SPZ_EXTENSIONS = (SPZ_EXTENSION, f"{EXTENSION}_compression_spz", _SPZ_ALONE)
-"""The extension of an SPZ, and its earlier names: within the splats' extension, and without it."""
+_SPZ_EXTENSIONS = (
+    *(SPZ_EXTENSION, f"{EXTENSION}_compression_spz"),
+    *("KHR_spz_gaussian_splats_compression", "KHR_spz_compression"),
+)
+"""The extension of an SPZ, and its earlier names: within the splats' extension, or beside or without it."""
+
+_SPLATS = re.compile(r"[A-Z]+_(gaussian_splat|spz)")
+"""How names of extensions for splats begin, also of earlier ones and of those that are not read."""
 
 LINEAR_NOTE = Note("linear_colors", 1, "linear colours are taken as sRGB, so renders are too dark")
 _SPZ_VERSION = 3
@@ -237,6 +243,7 @@ class _Primitive(msgspec.Struct):
 class _Splatting(msgspec.Struct, rename="camel"):
     kernel: Any = "ellipse"
     color_space: Any = None
+    quantized_position_scale: Any = 1
     extensions: dict[str, Any] = {}
 
 
@@ -356,7 +363,7 @@ def _axes(nodes: list[_Node]) -> Axes:
 
 
 def _has_splats(primitive: _Primitive) -> bool:
-    return bool({EXTENSION, _SPZ_ALONE} & set(primitive.extensions))
+    return any(map(_SPLATS.match, primitive.extensions))
 
 
 def _shown(path: Path, document: _Document, binary: bytes) -> Iterator[tuple[Noted, Float]]:
@@ -395,20 +402,21 @@ def _primitive(within: Place, document: _Document, binary: bytes, primitive: _Pr
     path = within.path
     place = within.to("extensions", EXTENSION)
     splats = checked(primitive.extensions.get(EXTENSION, {}), _Splatting, place)
-    inside = splats.extensions
-    if _SPZ_ALONE in primitive.extensions:
-        inside, place = primitive.extensions, within
-    if unknown := sorted(set(splats.extensions) - set(_SPZ_EXTENSIONS)):
+    held = {*splats.extensions, *filter(_SPLATS.match, primitive.extensions)}
+    if unknown := sorted(held - {EXTENSION, *_SPZ_EXTENSIONS}):
         raise InputError(f"unsupported extension {unknown[0]!r}", path=path)
+    if splats.quantized_position_scale != 1:
+        raise place.to("quantizedPositionScale").error("is unsupported")
     if splats.kernel != "ellipse":
         raise InputError("unsupported kernel; expected 'ellipse'", path=path)
     notes = [LINEAR_NOTE] if "lin" in str(splats.color_space).lower() else []
-    name = next((name for name in _SPZ_EXTENSIONS if name in inside), None)
+    name = next((name for name in _SPZ_EXTENSIONS if name in held), None)
     if name is None:
         scene, own = _attributes_of(within.to("attributes"), document, binary, primitive.attributes)
     else:
-        place = place.to("extensions", name)
-        packed = checked(inside[name], _Compressed, place)
+        within, inside = (place, splats) if name in splats.extensions else (within, primitive)
+        place = within.to("extensions", name)
+        packed = checked(inside.extensions[name], _Compressed, place)
         view = _view(document, packed.buffer_view, place, "the SPZ")
         scene, own = spz.decoded(path, binary[view.byte_offset : view.byte_offset + view.byte_length])
         scene = _about_y(scene)
@@ -425,20 +433,18 @@ def _attributes_of(place: Place, document: _Document, binary: bytes, names: dict
             place.to(name), document, binary, checked(names[name], Whole, place.to(name)), name, width
         )
 
-    own, draft = list(names), f"{EXTENSION}:SCALE" not in names and "_SCALE" in names
-    if draft:  # the extension's first draft
-        names = {
-            f"{EXTENSION}:{name[1:]}" if name.startswith("_") else name: at for name, at in names.items()
-        }
+    own, base, opacity = list(names), f"{EXTENSION}:SH_DEGREE_0_COEF_0", f"{EXTENSION}:OPACITY"
+    names = {f"{EXTENSION}:{name[1:]}" if name.startswith("_") else name: at for name, at in names.items()}
     degree = max(d for d in range(4) if d == 0 or f"{EXTENSION}:SH_DEGREE_{d}_COEF_0" in names)
     means = values("POSITION", 3)
     raw = Raw.empty(len(means), (degree + 1) ** 2 - 1)
-    color = values("COLOR_0", 4) if f"{EXTENSION}:SH_DEGREE_0_COEF_0" not in names and draft else None
-    opacities = values(f"{EXTENSION}:OPACITY", 1)[:, 0] if color is None else color[:, 3]
-    sh0 = values(f"{EXTENSION}:SH_DEGREE_0_COEF_0", 3) if color is None else (color[:, :3] - 0.5) / SH_C0
+    draft = base not in names and "COLOR_0" in names
+    color = values("COLOR_0", 4) if draft else np.zeros((0, 4), np.float32)
+    opacities = color[:, 3] if draft and opacity not in names else values(opacity, 1)[:, 0]
+    sh0 = (color[:, :3] - 0.5) / SH_C0 if draft else values(base, 3)
     notes = judge.fill(raw, values(f"{EXTENSION}:SCALE", 3), opacities, sh0)
     if draft:
-        text = f"written by the first draft of {EXTENSION} ({', '.join(own)})"
+        text = f"written by a draft of {EXTENSION} ({', '.join(own)})"
         notes.append(Note("first_draft", len(means), text))
     with np.errstate(invalid="ignore"):  # a signalling NaN
         raw.means[:] = means * _GLTF_TURN

@@ -247,7 +247,10 @@ def _open(path: Path, like: tuple[int, int] | None = None) -> Float32:
             values = np.asarray(image)[..., None]
         elif wide:
             words = _words(path, image, upright)
-            values = words / _white(path.parent, path.suffix, int(words.max()))
+            white = _white(path.parent, path.suffix, int(words[..., :3].max()))
+            values = words / white
+            if words.shape[2] == 4 and words[..., 3].max() > white:  # alpha may have more bits than colours
+                values[..., 3] = words[..., 3] / 65535
         else:
             values = np.asarray(_in_srgb(image), np.float32) / np.float32(255)
     if not (values.min() >= 0 and values.max() <= 1):  # also NaN
@@ -265,23 +268,29 @@ def _is_deep(image: Image.Image) -> bool:
 
 
 def _raw_mode(image: Any) -> str:
-    """Return what Pillow calls the 16-bit RGB or RGBA of an image; nothing for others."""
-    found = re.search("RGB[AX]?;16[BLN]", str(getattr(image, "tile", "")))
+    """Return what Pillow calls the 16-bit colours, or grey and alpha, of an image; nothing for others."""
+    found = re.search("(RGB[AX]?|LA);16[BLN]", str(getattr(image, "tile", "")))
     return found[0] if found else ""
 
 
 def _words(path: Path, image: Any, upright: bool) -> Values:
     """Return the (H, W, C) values of 16 bits. Of colours, Pillow decodes the upper bytes; told that they are
-    of the other byte order, it decodes the lower ones."""
+    of the other byte order, it decodes the lower ones. Grey and alpha have the size of its RGBA."""
     if image.mode.startswith("I"):
         return np.asarray(image)[..., None]
+    lower: Any
     with opened_image(path) as lower:
         raw = _raw_mode(lower)
-        other = raw[:-1] + ("L" if raw[-1] == "B" or (raw[-1] == "N" and sys.byteorder == "big") else "B")
-        for i, tile in enumerate(tiles := lower.tile):  # type: ignore[attr-defined]
+        big = raw[-1] == "B" or (raw[-1] == "N" and sys.byteorder == "big")
+        other = raw[:-1] + ("L" if big else "B")
+        if raw.startswith("LA"):  # only PNGs are
+            lower._mode = other = "RGBA"
+        for i, tile in enumerate(lower.tile):
             rest = () if isinstance(tile.args, str) else tile.args[1:]
-            tiles[i] = tile._replace(args=(other, *rest) if rest else other)
+            lower.tile[i] = tile._replace(args=(other, *rest) if rest else other)
         low = np.asarray(ImageOps.exif_transpose(lower) if upright else lower)
+    if raw.startswith("LA"):
+        return low.view(">u2")[..., [0, 0, 0, 1]]
     words = np.asarray(image).astype(np.uint16) * 256 + low
     return words[..., :3] if image.mode == "RGBX" else words
 

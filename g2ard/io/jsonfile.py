@@ -153,6 +153,8 @@ def _special(kind: type, value: Any) -> Any:
 
 def _wanted(message: str) -> str:
     """Return what msgspec expected instead, in the words of other messages."""
+    if message.startswith("Invalid enum value"):
+        return "which is not supported"
     wanted = message.partition(", got ")[0].replace("`", "")
     if wanted == "Number out of range" or "e+308" in wanted:
         return "expected a finite number"

@@ -1,5 +1,6 @@
 """Meaning of stored numbers, judged by most of them: a few strays decide nothing."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -21,6 +22,7 @@ _FEWEST = 16  # Gaussians that suffice to judge how they are stored
 _OUTSIDE, _ROUNDING = 0.1, 1e-3
 """Amounts by which opacities leave [0, 1] that tell logits, and that are clamped without a note."""
 
+_WIDE = 4.0  # scale over the distance of neighbours beyond which equal scales are doubted
 _LARGEST_LOGIT = 20.0  # whole numbers up to here may be logits
 
 
@@ -74,6 +76,12 @@ def coarse(positions: Values, apart: float) -> tuple[Note, ...]:
     return (Note("coarse_positions", len(positions), text),) if step > _FINE * apart > 0 else ()
 
 
+def spacing(positions: Values, count: int) -> float:
+    """Return the usual distance of `count` neighbours along the two longer sides of most (n, 3) positions."""
+    sides = [high - low for low, high in map(bulk, positions.T)]
+    return math.sqrt(math.prod(sorted(sides)[1:]) / max(1, count))
+
+
 def unpacked(packed: Values) -> list[Float]:
     """Return red, green and blue of PCL's colours, 0xRRGGBB in 32-bit integers or in floats of these bits."""
     bits = np.ascontiguousarray(packed).view("<u4")
@@ -121,12 +129,15 @@ class Reading:
 
 
 @np.errstate(invalid="ignore")  # signalling NaNs
-def judged(scales: Values, opacities: Values, base: Values, *, logs: bool) -> Reading:
+def judged(
+    scales: Values, opacities: Values, base: Values, *, logs: bool, apart: float = math.inf
+) -> Reading:
     """Judge how a scene's scales (n, k), opacities (n,) and base colours (n, 3) are stored.
 
     Args:
         logs: whether the format defines scales as logarithms and opacities as logits, otherwise as linear.
             The definition holds, and doubts are noted, unless the numbers make no sense in it.
+        apart: usual distance of neighbours, which equal scales do not exceed by much.
     """
     count, (small, large), (faint, solid) = len(opacities), bulk(scales), bulk(opacities)
     enough = count >= _FEWEST
@@ -144,11 +155,11 @@ def judged(scales: Values, opacities: Values, base: Values, *, logs: bool) -> Re
     elif not logs and (past := int(np.sum(np.abs(opacities - 0.5) > 0.5 + _ROUNDING))):
         text = f"{plural(past, 'opacity', 'opacities')} past [0, 1] clamped"
         notes.append(Note("opacities", past, text))
-    log_scales = logs
+    log_scales, unequal = logs, small < large or math.exp(min(small, 1)) > _WIDE * apart
     if not logs and small < 0:
         log_scales = True
         notes.append(Note("log_scales", count, "scales are below 0, so all are taken as logarithms"))
-    elif logs and enough and 0 < small < large and np.mean(scales, where=np.isfinite(scales)) < 1:
+    elif logs and enough and small > 0 and np.mean(scales, where=np.isfinite(scales)) < 1 and unequal:
         told.insert(0, f"scales ({small:.3g} to {large:.3g}) look linear, not logarithms")
     dark, bright = bulk(base)
     full = None

@@ -119,11 +119,13 @@ class Stream(RawStream):
         opacities = rows[self._names["opacity"]]
         with np.errstate(over="ignore", invalid="ignore"):
             wide = 2 * np.exp(np.median(scales)) if len(rows) else 0.0
-        self.notes += judge.coarse(self._columns(rows, _MEANS), float(wide))
+        means = self._columns(rows, _MEANS)
+        self.notes += judge.coarse(means, float(wide))
+        apart = judge.spacing(means, self.count)
         if self._rgb is None:
-            return judge.judged(scales, opacities, base, logs=True), 1.0
+            return judge.judged(scales, opacities, base, logs=True, apart=apart), 1.0
         full = judge.white(base, judge.full_scales(base.dtype))
-        return judge.judged(scales, opacities, np.zeros((0, 3)), logs=True), full
+        return judge.judged(scales, opacities, np.zeros((0, 3)), logs=True, apart=apart), full
 
     def _decode(self, block: Values, raw: Raw) -> None:
         raw.means[:] = self._means(block)

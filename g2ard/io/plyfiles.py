@@ -15,6 +15,7 @@ from g2ard.config.choices import AXES, Axes, RenderModel
 from g2ard.errors import InputError, damaged
 from g2ard.io.atomic import atomic_output
 from g2ard.io.paths import plain_numbers
+from g2ard.io.signs import AGAIN
 from g2ard.io.types import Float, Values
 from g2ard.scene.splats import Splats
 from g2ard.scene.transform import moved_axes
@@ -249,7 +250,20 @@ def read_element(path: Path, header: PlyHeader, *names: str, plain: bool = False
         ) from error
     except (PlyParseError, ValueError, OSError, OverflowError, MemoryError) as error:
         raise InputError(f"cannot be read as a PLY: {error}", path=path) from error
+    last = ply.elements[-1].data
+    if isinstance(last, np.memmap):
+        _check_rest(path, last.offset + last.nbytes)
     return [ply[name].data for name in names]
+
+
+def _check_rest(path: Path, end: int) -> None:
+    """Raise an `InputError` for more than line ends and zeros after the last row, which ends at a byte."""
+    with path.open("rb") as file:
+        file.seek(end)
+        if not file.read(_HEADER_LIMIT).strip(b"\0\r\n\t "):
+            return
+    text = f"has {path.stat().st_size - end:,} bytes after its last row: a transfer as text changed line ends"
+    raise InputError(f"{text}, or its header states too few rows", path=path, hint=AGAIN)
 
 
 def _read(

@@ -91,13 +91,13 @@ _CAPTURE, _PIX4D = "a table of cameras of RealityCapture (RealityScan)", "camera
 _AS_TEXT = (
     b"changed by a transfer as text"  # what `_head` adds to binary files all of whose line ends are CR LF
 )
-_AGAIN = "get it again as binary (FTP: binary mode; git: `*.ply binary` in .gitattributes)"
+AGAIN = "get it again as binary (FTP: binary mode; git: `*.ply binary` in .gitattributes)"
 
 _UNFINISHED = "*.crdownload *.part *.partial *.download *.opdownload *.aria2 *.!ut *.filepart"
 
 SIGNS = (
     Sign("an unfinished download", "wait until it is complete, or download it again", names=_UNFINISHED),
-    Sign("damaged by a transfer as text, which made each line end CR LF", _AGAIN, words=(_AS_TEXT,)),
+    Sign("damaged by a transfer as text, which made each line end CR LF", AGAIN, words=(_AS_TEXT,)),
     Sign("a pointer of Git LFS, not the file itself", "`git lfs pull` gets it", (b"version https://git-lfs",)),
     Sign("a viewer's page with a scene inside (SuperSplat)", _EDITOR, (b"<!doctype html", b"<html"), (b"supersplat",)),
     Sign("an HTML page, not the file itself", _LINK, (b"<!doctype html", b"<html")),

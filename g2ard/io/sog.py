@@ -307,6 +307,7 @@ class _Node(msgspec.Struct):
 class _Levels(msgspec.Struct):
     tree: _Node
     filenames: list[FileName]
+    version: Literal[1] = 1
     environment: str | None = None
 
 
@@ -333,7 +334,7 @@ def _listed(index: Path) -> list[Path]:
     """Return the chunks that lod-meta.json's tree uses at level 0, in the order of its list, and the sky."""
     content = checked(read_json(index), _Levels, Place(index))
     names, sky = content.filenames, content.environment
-    files = [_chunk_at(index.parent / name) for name in names]
+    files = [_chunk_at(index.parent / name.replace("\\", "/")) for name in names]
     used: set[int] = set()
     nodes = [(content.tree, Place(index).to("tree"))]
     while nodes:
@@ -435,6 +436,9 @@ def _chunk(path: Path) -> Iterator[_Chunk]:
         return
     try:
         with zipfile.ZipFile(path) as bundle:
+            for info in bundle.infolist():  # as .NET writes them on Windows
+                info.filename = info.filename.replace("\\", "/")
+                bundle.NameToInfo[info.filename] = info
             inside = [name for name in bundle.namelist() if name.rpartition("/")[2] == "meta.json"]
             if not inside:
                 raise InputError("has no meta.json", path=path)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
@@ -240,8 +239,7 @@ class PointStream(Stream[RawPoints]):
         self._zeros_are_lost = away or zeros > max(_FEW_BLACK, _BLACK_SHARE * len(good))
         good = placed if self._zeros_are_lost and placed.any() else good
         self.sample = positions[good]
-        wide = np.sort(extent)[1:].prod()
-        notes = (*notes, *judge.coarse(self.sample, math.sqrt(wide / max(1, count))))
+        notes = (*notes, *judge.coarse(self.sample, judge.spacing(self.sample, count)))
         notes = (*notes, _DEGREES) if _in_degrees(middle, extent) else notes
         super().__init__(path, count, np.rint(middle) if far else None, notes, "point")
         self.channels, self.scales = values.shape[1], scales

@@ -50,7 +50,12 @@ def read_trajectory(path: Path, names: Sequence[str]) -> dict[str, NDArray[np.fl
         text = f"is a trajectory of {len(poses)} poses, and no time in it is that of a photo ({names[0]})"
         hint = "name photos by their times, or give as many poses as photos"
         raise InputError(text, path=path, hint=hint)
-    return dict(zip(sorted(names), poses, strict=True))
+    return dict(zip(sorted(names, key=_numbered), poses, strict=True))
+
+
+def _numbered(name: str) -> list[str | int]:
+    """Return a key that sorts names by their numbers, such as 2.png before 10.png."""
+    return [int(part) if part.isdecimal() else part for part in re.split(r"(\d+)", name)]
 
 
 def _by_time(times: NDArray[np.float64], names: Sequence[str]) -> dict[str, int]:

@@ -17,7 +17,7 @@ from g2ard.config.choices import NAMED_AXES, Axes, AxesName
 from g2ard.config.schema import Settings
 from g2ard.errors import InputError, require
 from g2ard.poses.site import Site
-from g2ard.progress import Progress, counter, silent
+from g2ard.progress import Progress, counter, plural, silent
 from g2ard.scene.reproducible import middle
 from g2ard.scene.splats import SH_C0, Splats, unit_colors
 from g2ard.scene.transform import up_in
@@ -27,6 +27,8 @@ _FAR_FROM_ORIGIN = 32_752.0
 
 _GUESSED_BY = 20_000
 """Points that tell which axis is up, if the format does not."""
+
+_ISOLATED = 20.0  # size of an isolated point's disc over the usual one
 
 _CORE = _core.defaults()["lift"]
 """Defaults of the Rust core, which are the paper's."""
@@ -156,6 +158,17 @@ def lift_rows(
         offset=np.zeros(3) if near else origin,
     )
     return splats, rows
+
+
+def isolated(splats: Splats) -> str | None:
+    """Say how many discs are much larger than most, since their points are far from others."""
+    sizes = splats.scales.max(axis=1)
+    usual = float(np.median(sizes))
+    count = int(np.count_nonzero(sizes > _ISOLATED * usual))
+    if not count:
+        return None
+    text = f"became discs of up to {sizes.max() / usual:,.0f} times the usual size"
+    return f"{plural(count, 'isolated point')} {text}; remove strays first, as with CloudCompare's SOR filter"
 
 
 def merged(points: NDArray[np.float64], colors: NDArray[Any]) -> tuple[NDArray[np.intp], NDArray[Any]]:

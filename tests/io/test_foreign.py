@@ -12,9 +12,10 @@ import pytest
 from PIL import Image
 
 from g2ard.errors import InputError
-from g2ard.io import kind, write_splats
+from g2ard.io import kind, write_points, write_splats
 from g2ard.io.signs import SIGNS, Sign, sign_of
 from g2ard.io.source import Source
+from g2ard.io.types import Points
 from g2ard.io.views import read_view_set
 from helpers.cloud_files import las
 from helpers.opened import read_scene
@@ -174,6 +175,22 @@ def test_files_that_a_transfer_changed_are_refused(tmp_path: Path, name: str) ->
     changed.write_bytes(as_text(path.read_bytes()))
     with pytest.raises(InputError, match=r"transfer as text|damaged"):
         Source(changed).count
+
+
+@pytest.mark.parametrize("name", ["a.ply", "a.compressed.ply", "cloud.ply"])
+def test_bytes_after_the_last_row_are_refused(tmp_path: Path, name: str) -> None:
+    truth, path = scene(3000, 0), tmp_path / name
+    if name == "cloud.ply":
+        write_points(path, Points(truth.means.astype(float), np.full((3000, 3), 0.5, np.float32)))
+    else:
+        write_splats(path, truth)
+    head, end, rows = path.read_bytes().partition(b"end_header\n")
+    for changed in (rows.replace(b"\n", b"\n\n"), rows + rows[-200:]):
+        path.write_bytes(head + end + changed + b"\1")
+        with pytest.raises(InputError, match=r"bytes after its last row: a transfer as text"):
+            Source(path).count
+    path.write_bytes(head + end + rows + b"\r\n\0\0")
+    assert Source(path).count == 3000
 
 
 @pytest.mark.parametrize("suffix", [" (1)", "", "_1", ".ply (2)", ".download2", ".bak", ".ply.txt"])

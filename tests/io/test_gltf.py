@@ -71,24 +71,37 @@ def test_several_primitives_are_joined(tmp_path: Path, in_one_mesh: bool) -> Non
     assert [note.code for note in found.notes] == ["ignored_meshes"]
 
 
-NAMES = (f"{EXTENSION}_compression_spz", "KHR_spz_gaussian_splats_compression")
+INSIDE = (SPZ_EXTENSION, f"{EXTENSION}_compression_spz")
+BESIDE = ("KHR_spz_gaussian_splats_compression", "KHR_spz_compression")
 
 
-@pytest.mark.parametrize("alone", [True, False])
+@pytest.mark.parametrize(
+    ("name", "alone"), [*((name, False) for name in INSIDE + BESIDE), *((name, True) for name in BESIDE)]
+)
 @pytest.mark.parametrize("degree", [0, 3])
-def test_earlier_names_of_an_spz(tmp_path: Path, alone: bool, degree: int) -> None:
+def test_earlier_names_of_an_spz(tmp_path: Path, name: str, alone: bool, degree: int) -> None:
     document, binary = parts_of(tmp_path, scene(degree=degree), compress="spz")
     wanted = read_splats(tmp_path / "one.glb")
     held = document["meshes"][0]["primitives"][0]["extensions"]
     inside = held[EXTENSION]["extensions"].pop(SPZ_EXTENSION)
     if alone:
         held.clear()
-        held[NAMES[1]] = inside
-    else:
-        held[EXTENSION]["extensions"][NAMES[0]] = inside
+    (held if name in BESIDE else held[EXTENSION]["extensions"])[name] = inside
     found = read_splats(write_glb(tmp_path / "a.glb", document, binary))
     np.testing.assert_array_equal(found.means, wanted.means)
     np.testing.assert_array_equal(found.shN, wanted.shN)
+
+
+@pytest.mark.parametrize("name", ["CESIUM_gaussian_splatting", "EXT_spz_3", f"{EXTENSION}_of_tomorrow"])
+@pytest.mark.parametrize("alone", [True, False])
+def test_other_extensions_of_splats_are_named(tmp_path: Path, name: str, alone: bool) -> None:
+    document, binary = parts_of(tmp_path, scene())
+    held = document["meshes"][0]["primitives"][0]["extensions"]
+    if alone:
+        held.clear()
+    held[name] = {}
+    with pytest.raises(InputError, match=f"unsupported extension '{name}'"):
+        read_splats(write_glb(tmp_path / "a.glb", document, binary))
 
 
 @pytest.mark.parametrize("inside", [True, False])

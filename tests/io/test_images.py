@@ -210,7 +210,7 @@ def words_png(words: np.ndarray) -> bytes:
     def chunk(name: bytes, data: bytes) -> bytes:
         return struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
 
-    head = struct.pack(">IIBBBBB", width, height, 16, {1: 0, 3: 2, 4: 6}[channels], 0, 0, 0)
+    head = struct.pack(">IIBBBBB", width, height, 16, {1: 0, 2: 4, 3: 2, 4: 6}[channels], 0, 0, 0)
     return (
         b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", zlib.compress(raw)) + chunk(b"IEND", b"")
     )
@@ -255,6 +255,23 @@ def test_photos_of_fewer_bits_in_16(
         np.testing.assert_allclose(
             got, np.broadcast_to(light * true[..., :3], got.shape), atol=0.6 / (2**bits - 1)
         )
+
+
+@pytest.mark.parametrize("bits", [10, 12, 14, 16])
+@pytest.mark.parametrize("channels", [2, 4])
+@pytest.mark.parametrize("opaque", [0, 65535])
+def test_alpha_of_all_bits_beside_colours_of_fewer(
+    tmp_path: Path, channels: int, bits: int, opaque: int
+) -> None:
+    top = 2**bits - 1
+    words = np.random.default_rng(bits).integers(0, top + 1, (6, 8, channels))
+    words[0, 0, 0] = top
+    words[..., -1] = np.where(words[..., 0] % 2, opaque or top, 0)
+    (tmp_path / "a.png").write_bytes(words_png(words.astype("<u2")))
+    got = load_photo(camera(tmp_path / "a.png", (8, 6)), 0, None)[0]
+    np.testing.assert_array_equal(got[..., 3], words[..., -1] > 0)
+    wanted = words[..., :-1] * (words[..., -1:] > 0) / top
+    np.testing.assert_allclose(got[..., :3], np.broadcast_to(wanted, (6, 8, 3)), atol=1e-6)
 
 
 def test_a_photo_brighter_than_its_folder_keeps_its_own_range(tmp_path: Path) -> None:

@@ -327,6 +327,19 @@ def test_animated_scenes_are_read_at_frame_0(tmp_path: Path, names: list[str]) -
     assert "frame 0" in found.notes[0].text
 
 
+@pytest.mark.parametrize("sizes", [(0.01, 0.01, 0.01), (0.02, 0.02, 0.001)])
+@pytest.mark.parametrize("logs", [True, False])
+def test_equal_scales_that_look_linear_are_noted(
+    tmp_path: Path, sizes: tuple[float, float, float], logs: bool
+) -> None:
+    truth = scene(count=200, seed=4)
+    stored = np.log(sizes) if logs else sizes
+    cols = columns(truth) | {f"scale_{i}": np.full(200, stored[i]) for i in range(3)}
+    cols |= {axis: 0.1 * truth.means[:, i] for i, axis in enumerate("xyz")}
+    notes = read_scene(save(tmp_path / "a.ply", cols)).notes
+    assert [note.code for note in notes] == ["activated"] * (not logs)
+
+
 @pytest.mark.parametrize("unit", [0.05, 1.0])
 @pytest.mark.parametrize("what", ["scales", "opacities", "both", "neither"])
 def test_activated_values_are_noted(tmp_path: Path, what: str, unit: float) -> None:

@@ -106,6 +106,17 @@ def test_lod_meta_lists_the_chunks(tmp_path: Path) -> None:
     check_fault(caught.value, tmp_path / "lod-meta.json", ("filenames[1]", None))
 
 
+@pytest.mark.parametrize("slash", ["/", "\\"])
+def test_names_of_windows_in_indexes(tmp_path: Path, slash: str) -> None:
+    folder(tmp_path / "a", parts(count=4))
+    index = {"version": 1, "filenames": [f"a{slash}meta.json"], "tree": {"lods": {"0": {"file": 0}}}}
+    (tmp_path / "lod-meta.json").write_text(json.dumps(index))
+    assert len(read_splats(tmp_path)) == 4
+    (tmp_path / "lod-meta.json").write_text(json.dumps({**index, "version": 2}))
+    with pytest.raises(InputError, match="'version' is 2, which is not supported"):
+        read_splats(tmp_path)
+
+
 def test_full_opacity_is_kept_and_counted(tmp_path: Path) -> None:
     files = parts(count=3)
     files["sh0.webp"] = webp(square(np.array([[1, 2, 3, 255], [1, 2, 3, 0], [1, 2, 3, 128]])))

@@ -69,16 +69,24 @@ def test_chunks_of_streamed_sog_as_archives(tmp_path: Path) -> None:
         assert len(read_scene(path).splats) == 20
 
 
-def test_the_first_draft_of_gltf(tmp_path: Path) -> None:
+@pytest.mark.parametrize("below", ["", "scene\\", "a b\\scene\\"])
+def test_archives_with_backslashes(tmp_path: Path, below: str) -> None:
+    files = {below + name: content for name, content in parts().items()}
+    assert len(read_scene(zipped(tmp_path / "a.sog", files)).splats) == 10
+
+
+@pytest.mark.parametrize("prefix", ["_", f"{EXTENSION}:"])
+@pytest.mark.parametrize("opacity", [False, True])
+def test_drafts_of_gltf(tmp_path: Path, prefix: str, opacity: bool) -> None:
     wanted = scene(10, 0)
     write_splats(tmp_path / "a.glb", wanted)
     document, binary = glb_parts(tmp_path / "a.glb")
     names = document["meshes"][0]["primitives"][0]["attributes"]
+    kept = ["SCALE", "ROTATION", *(["OPACITY"] if opacity else [])]
     for name in list(names):
-        if name.startswith(EXTENSION) and name.split(":")[1] not in ("SCALE", "ROTATION"):
-            del names[name]
-        elif name.startswith(EXTENSION):
-            names[f"_{name.split(':')[1]}"] = names.pop(name)
+        if name.startswith(EXTENSION):
+            plain, at = name.split(":")[1], names.pop(name)
+            names |= {prefix + plain: at} if plain in kept else {}
     found = read_scene(write_glb(tmp_path / "b.glb", document, binary))
     np.testing.assert_allclose(found.splats.scales, wanted.scales, rtol=1e-5)
     np.testing.assert_allclose(found.splats.opacities, wanted.opacities, atol=1e-4)

@@ -45,6 +45,18 @@ def test_six_columns(tmp_path: Path, suffix: str, between: str, point: str, top:
     is_cloud(written(tmp_path / f"a{suffix}", [XYZ, RGB], between, point, top.format(between)))
 
 
+@pytest.mark.parametrize("intensity", ["before", "after"])
+@pytest.mark.parametrize("normals", [0, 3])
+def test_intensities_like_colours_beside_colours(tmp_path: Path, intensity: str, normals: int) -> None:
+    """Channels of colours vary together, and reflected light does not with them."""
+    xyz, rng = RNG.uniform(-5, 5, (300, 3)).round(3), np.random.default_rng(5)
+    rgb = np.clip(rng.integers(0, 256, (300, 1)) + rng.integers(-30, 31, (300, 3)), 1, 255)
+    light = rng.integers(0, 256, (300, 1))
+    shades = [light, rgb] if intensity == "before" else [rgb, light]
+    path = written(tmp_path / "a.xyz", [xyz, *shades, xyz[:, :normals] / 9])
+    np.testing.assert_allclose(read_cloud(path).points.colors, rgb / 255, atol=1e-6)
+
+
 @pytest.mark.parametrize(
     ("columns", "top"),
     [
@@ -213,6 +225,13 @@ def test_trajectories(tmp_path: Path, file: str, times: str, names: str) -> None
     found = poses_for(path, photos)
     for name, view in zip(photos, orbit(6), strict=True):
         np.testing.assert_allclose(found[name], view, atol=1e-5)
+
+
+def test_matrices_go_with_photos_by_their_numbers(tmp_path: Path) -> None:
+    path = trajectory(tmp_path / "kitti.txt", [str(i) for i in range(12)])
+    found = poses_for(path, [f"{i}.png" for i in (11, *range(11))])
+    for i, view in enumerate(orbit(12)):
+        np.testing.assert_allclose(found[f"{i}.png"], view, atol=1e-5)
 
 
 def test_trajectories_of_other_photos_are_refused(tmp_path: Path) -> None:

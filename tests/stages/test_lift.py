@@ -5,7 +5,7 @@ import pytest
 
 from g2ard.errors import InputError
 from g2ard.scene.splats import SH_C0
-from g2ard.stages.lift import _anchor, lift
+from g2ard.stages.lift import _anchor, isolated, lift
 from helpers.clouds import lines, surface
 from helpers.threads import on_threads
 from reference.lift import discs
@@ -19,6 +19,16 @@ def test_spread_is_an_option():
     assert got.sh_degree == 0
     _, want_scales = discs(points - _anchor(points), spread=0.6)
     np.testing.assert_allclose(got.scales, want_scales, rtol=1e-5)
+
+
+@pytest.mark.parametrize(("count", "told"), [(6, False), (60, True)])
+def test_flocks_far_from_a_surface_are_told(count: int, told: bool) -> None:
+    rng = np.random.default_rng(1)
+    plain = np.column_stack([rng.uniform(0, 50, (3000, 2)), rng.normal(0, 0.05, 3000)])
+    flock = np.array([20, 20, 500]) + rng.normal(0, 40, (count, 3))
+    points = np.concatenate([plain, flock])
+    text = isolated(lift(points, np.full_like(points, 0.5)))
+    assert (text is not None and "isolated points" in text) == told
 
 
 def test_translation_and_scale_by_powers_of_two_are_exact():

@@ -31,6 +31,7 @@ def lift(
 ) -> None:
     """Turn a coloured point cloud into surface-aligned Gaussian discs, without training."""
     from g2ard.jobs.inputs import axes_of
+    from g2ard.stages.lift import isolated
     from g2ard.stages.lift import lift as lift_points
 
     run.claim_scene("--output", output)
@@ -52,6 +53,8 @@ def lift(
         progress=run.progress,
     )
     lifted = time.perf_counter()
+    if strays := isolated(splats):
+        run.say(f"{cloud}: {strays}")
     run.write(output, splats)
     written = time.perf_counter()
     say_weight(run, cloud, output, splats)
