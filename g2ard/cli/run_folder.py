@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import shlex
+import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
@@ -181,39 +183,45 @@ class RunFolder:
     def write_pages(
         self, source: Source | Path, job: Any, done: Any, report: RunReport, told: Sequence[str]
     ) -> tuple[RunReport, str]:
-        """Write report.html, preview.png and with --page view.html; return the report with the size of that
+        """Write preview.png, with --page view.html, and report.html; return the report with the size of that
         page, and a line about it.
 
         Args:
             source: what was distilled.
             told: the summary that the command prints.
         """
-        from g2ard.report.distilled import distill_report, preview
+        from g2ard.report.distilled import distill_report, pictures, preview, renderers_of
 
         title = f"{names_of([Path(str(source))])[0]}: {report.title}"
         scenes = [] if report.photos else [("simplified", done.simplified)]  # a start of photos is a blur
         scenes.append((RESULT, done.splats))
         targets = list(filter(None, (done.held_out, job.targets.apart)))
         recover, page = job.config.recover, self.path / "report.html"
-        best = None
+        renderers, best, drawn = renderers_of(scenes, recover.background), None, []
         with self._run.showing("choosing views for report.html"):
             best = job.best(done)
-        if best is None:
+            drawn = [pictures(best, row, list(renderers.values())) for row in range(len(best.cameras))]
+        if best is None or not drawn:
             return report, ""
-        with self._run.showing("report.html"):
-            distill_report(page, title, scenes, targets, report, recover.background, told, best=best)
         with self._run.showing(_PICTURE):
-            preview(self.path / _PICTURE, best, scenes, recover.background)
-        if not self._run.config["page"]:
-            return report, ""
-        dense = None
-        if isinstance(source, Source) and not recover.from_points and job.plan is None:
-            dense = source, job.prior
-        seen = job.views.train.cameras if job.views.pool is None else best.cameras
-        size, line = None, ""
-        with self._run.showing("view.html"):
-            size, line = self.write_view(done.splats, dense, seen, recover.background)
-        return replace(report, bytes={**report.bytes, "view": size}), line
+            preview(self.path / _PICTURE, drawn, scenes)
+        line = ""
+        if self._run.config["page"]:
+            dense = None
+            if isinstance(source, Source) and not recover.from_points and job.plan is None:
+                dense = source, job.prior
+            seen = job.views.train.cameras if job.views.pool is None else best.cameras
+            size = None
+            with self._run.showing("view.html"):
+                size, line = self.write_view(done.splats, dense, seen, recover.background)
+            report = replace(report, bytes={**report.bytes, "view": size})
+        with self._run.showing("report.html"):
+            files = {self.scene.name: self.scene.name, "view in the browser": self._view.name, "folder": "."}
+            files = {text: name for text, name in files.items() if (self.path / name).exists()}
+            command = shlex.join(["g2ard", *sys.argv[1:]])
+            shown: Any = {"best": drawn[0], "command": command, "files": files}
+            distill_report(page, title, renderers, targets, report, told, **shown)
+        return report, line
 
     def write_report(self, report: Report) -> None:
         told = {**report.as_dict(), "config": self._run.config, "inputs": self._inputs}

@@ -121,7 +121,7 @@ def cost_of(job: Any, count: int, *, page: bool = True) -> Cost:
         stages += _merging_stages(job.plan, job.total, len(train), gaps=not job.recovers)
     scored = len(test) + apart // 2 + twice  # the others validate
     after = [("scoring", _each(_SCORE, size, count) * scored + target * twice)]
-    after += [("report.html", _REPORT), ("view.html", _PAGE)] if page else []
+    after += [("view.html", _PAGE), ("report.html", _REPORT)] if page else []
     if steps:
         if job.time is not None:
             others = job.prepared - job.began + sum(seconds for _, seconds in [*stages, *after])

@@ -174,10 +174,7 @@ class DistillJob:
         """Targets of the views, made on access; see `make_targets`."""
         views, say = self.views, self.say
 
-        def made(cameras: Cameras, say: Say = unsaid) -> Targets:
-            background, mixed = self.config.recover.background, self.photos_over_renders
-            return make_targets(cameras, self.render, background, mixed=mixed, say=say)
-
+        made = self._made
         train, held_out = made(views.train.cameras, say), scorable(made(views.test, say), say)
         validation = apart = None
         if self.renders and views.apart is not None and len(views.apart) > 1:
@@ -186,15 +183,22 @@ class DistillJob:
         twice = None if views.twice is None or not self.renders else made(views.twice)
         return RunTargets(train, held_out, validation, apart, full, twice)
 
+    def _made(self, cameras: Cameras, say: Say = unsaid) -> Targets:
+        background, mixed = self.config.recover.background, self.photos_over_renders
+        return make_targets(cameras, self.render, background, mixed=mixed, say=say)
+
     def best(self, done: Distilled) -> Targets:
         """Return targets of the views that show the result best: placed ones, or some of the scored ones."""
-        held_out = self.targets.held_out
+        held_out, full = self.targets.held_out, self.views.full
         cameras, pool = held_out.cameras, self.views.pool
         if not self.renders or pool is None:
             names = best_views(done.splats, _SHOWN, cameras).names
+            if full is not None:
+                larger = full.take([full.names.index(name) for name in names]).resized(_PICTURE)
+                return done.scored_on(self._made(larger))
             return done.scored_on(Subset(held_out, [cameras.names.index(name) for name in names]))
         found = best_level(self.prior, _SHOWN, pool.cameras)
-        longest = int(np.maximum(cameras.widths, cameras.heights).max())
+        longest = max(_PICTURE, int(np.maximum(cameras.widths, cameras.heights).max()))
         return self.dense.images(found.scaled(longest), self.config.recover.background)
 
     def run(self, work: Path | None = None) -> Distilled:
@@ -390,6 +394,9 @@ _NO_PHOTOS = "no photos: the lifted points render the training images; photos, g
 
 _SHOWN = 3
 """Views in pictures of a run."""
+
+_PICTURE = 800
+"""Longer side in pixels of a view in these pictures, at least, also after --size."""
 
 _USUAL_RATIO = 10
 """Reduction for which views are chosen if the count is measured later, in these views."""

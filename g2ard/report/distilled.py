@@ -1,9 +1,12 @@
 """Report page and preview picture of a distillation."""
 
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from itertools import zip_longest
 from pathlib import Path
 from statistics import fmean
+from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +16,7 @@ from g2ard.io.images import to_bytes, write_png
 from g2ard.io.labels import DENSE, RESULT, TARGET, labels_of
 from g2ard.progress import plural
 from g2ard.rendering.exposure import rendered
+from g2ard.rendering.metrics import psnr
 from g2ard.rendering.renderer import Renderer
 from g2ard.rendering.targets import Targets, mask_of
 from g2ard.report.page import Page, Shown
@@ -20,48 +24,75 @@ from g2ard.report.run import COLUMNS, LOST, KindScore, RunReport, cells
 from g2ard.report.sheet import contact_sheet
 from g2ard.scene.cameras import rows_by_kind
 from g2ard.scene.splats import Splats
-from g2ard.stages.evaluate import ViewScore, evaluate
+from g2ard.stages.evaluate import ViewScore
 
 _SHOWN = 3  # worst views of the page, at most
+_PICTURE = 1200
+"""Least width in pixels of preview.png."""
 _UNSCORED = np.float32(0.5)
+
+
+@dataclass(frozen=True, eq=False)
+class Pictures:
+    """A view's target and what scenes show there, with their PSNR; pixels that are not scored are grey."""
+
+    name: str
+    target: NDArray[np.uint8]
+    images: list[NDArray[np.uint8]]
+    psnrs: list[float]
+
+
+def pictures(targets: Targets, view: int, renderers: Sequence[Renderer]) -> Pictures:
+    """Render a view of targets."""
+    mask, target = mask_of(targets, view), targets[view]
+    renders = [rendered(renderer, targets, view) for renderer in renderers]
+    psnrs = [psnr(image, target, mask) for image in renders]
+    shown = [to_bytes(scored(image, targets, view)) for image in renders]
+    return Pictures(targets.cameras.names[view], to_bytes(scored(target, targets, view)), shown, psnrs)
+
+
+def renderers_of(scenes: Sequence[tuple[str, Splats]], background: Colour = BLACK) -> dict[str, Renderer]:
+    """Return a renderer for each scene by its name."""
+    return {name: Renderer(splats, background=background) for name, splats in scenes}
 
 
 def distill_report(
     path: Path,
     title: str,
-    scenes: Sequence[tuple[str, Splats]],
+    renderers: Mapping[str, Renderer],
     targets: Sequence[Targets],
     report: RunReport,
-    background: Colour = BLACK,
     told: Sequence[str] = (),
     *,
-    best: Targets,
+    best: Pictures,
+    command: str = "",
+    files: Mapping[str, str] = MappingProxyType({}),
 ) -> None:
     """Write the HTML page of one run: a verdict, scores by kind of view, and pictures of the view that shows
     most and of the worst ones.
 
     Args:
-        scenes: (name, scene) of those in pictures, the result last.
+        renderers: of the scenes in pictures by name, the result last.
         targets: photos or teacher renders of the held-out views, and of the views of other kinds, if any.
         told: summary lines that the command prints.
-        best: targets whose first view shows most of the scene.
+        best: a view that shows most of the scene.
+        command: the command line of the run.
+        files: text of links → files of the run, relative to the page; the first is the scene.
     """
     page = Page(title, verdict(report))
+    if files:
+        page.links(files, f"{report.sizes}: ")
     views = [(part, row) for part in targets for row in range(len(part.cameras))]
     parts = [part for part in (report.scores, report.apart) if part]
     scores = {name: [view for part in parts for view in part[name].views] for name in report.scores}
     before, after = scores["simplified"], scores["recovered"]
     scores[RESULT] = after
-    renderers = [(name, Renderer(splats, background=background)) for name, splats in reversed(scenes)]
 
-    def show(part: Targets, row: int, psnrs: Sequence[float]) -> None:
-        camera = part.cameras[row]
-        shown = [
-            Shown(stage, to_bytes(scored(rendered(renderer, part, row), part, row)), f"{psnr:.2f} dB")
-            for (stage, renderer), psnr in zip(renderers, psnrs, strict=True)
-        ]
-        title = f"{part.cameras.names[row]}, {camera.width}×{camera.height} px"
-        page.comparison(title, to_bytes(scored(part[row], part, row)), shown)
+    def show(drawn: Pictures) -> None:
+        named = zip(renderers, drawn.images, drawn.psnrs, strict=True)
+        shown = [Shown(stage, image, f"{score:.2f} dB") for stage, image, score in named]
+        height, width = drawn.target.shape[:2]
+        page.comparison(f"{drawn.name}, {width}×{height} px", drawn.target, shown[::-1])
 
     source = "a photo" if report.photos else f"a photo or a render of the {DENSE}"
     if "photo" not in report.against:
@@ -70,8 +101,7 @@ def distill_report(
     page.paragraph(
         f"Left of the divider: the {TARGET}, {source}. Right: the {RESULT}. Its worst regions are magnified."
     )
-    whole = [evaluate(splats, best, background=background).views[0].psnr for _, splats in reversed(scenes)]
-    show(best, 0, whole)
+    show(best)
     page.heading("Scores")
     page.table(COLUMNS, cells(report.kinds))
     page.paragraph(f"PSNR and SSIM: {report.stages}, in views of {report.size}.")
@@ -84,17 +114,32 @@ def distill_report(
         page.paragraph(f"Views that ended below their start: {', '.join(text for _, text in lost)}.")
     shown = list(dict.fromkeys([*(row for row, _ in lost[:1]), *_worst(after)]))[:_SHOWN]
     shown.sort(key=lambda row: after[row].psnr)
-    worst = [view for view in shown if after[view].name != best.cameras.names[0]]
+    worst = [view for view in shown if after[view].name != best.name]
     if worst:
         page.heading("Worst views")
     for view in worst:
-        show(*views[view], [scores[stage][view].psnr for stage, _ in renderers])
+        show(pictures(*views[view], list(renderers.values())))
     page.paragraph(
-        f"{report.sizes}, in {report.seconds['total']:,.0f} s. "
-        f"Scored against {report.against} in views that were not trained on, "
-        f"which blend {report.overdraw:.1f} Gaussians per pixel."
+        f"Made in {report.seconds['total']:,.0f} s. Scored against {report.against} in views that were not "
+        f"trained on, which blend {report.overdraw:.1f} Gaussians per pixel."
     )
+    if command:
+        page.heading("Command")
+        page.code([command])
+        page.details("settings", [[name, str(value)] for name, value in report.settings.items()])
+    if files:
+        scene = next(iter(files.values()))
+        page.heading("What next")
+        page.code(line.format(scene) for line in _NEXT)
     page.write(path)
+
+
+_NEXT = (
+    "g2ard distill {} --fit 5MB --format sog -o smaller/    # a smaller file",
+    "g2ard lod {} -o streamed/                              # levels of detail that a browser streams",
+    "g2ard adapt {} --views photos/ -o adapted.ply          # colours of other photos",
+)
+"""Commands for a result."""
 
 
 def edges_line(kinds: Sequence[KindScore]) -> str | None:
@@ -158,30 +203,21 @@ def _worst(scores: Sequence[ViewScore]) -> list[int]:
     return [row for turn in zip_longest(*kinds) for row in turn if row is not None][:_SHOWN]
 
 
-def preview(
-    path: Path, targets: Targets, scenes: list[tuple[str, Splats]], background: Colour = BLACK
-) -> None:
+def preview(path: Path, drawn: Sequence[Pictures], scenes: Sequence[tuple[str, Splats]]) -> None:
     """Write a PNG with a row for each view: target, then each scene with its PSNR.
 
-    Pixels that are not scored are grey in all of them.
+    Small images are enlarged, so that the picture is at least 1,200 pixels wide.
     """
-    cameras = targets.cameras
-    renderers = [Renderer(splats, background=background) for _, splats in scenes]
-    scores = [evaluate(splats, targets, background=background).views for _, splats in scenes]
+    times = max(1, math.ceil(_PICTURE / sum(image.shape[1] for image in (drawn[0].target, *drawn[0].images))))
     rows = [
-        [
-            scored(image, targets, view)
-            for image in (targets[view], *(rendered(r, targets, view) for r in renderers))
-        ]
-        for view in range(len(cameras))
+        [image.repeat(times, 0).repeat(times, 1) for image in (view.target, *view.images)] for view in drawn
     ]
+    names = [name for name, _ in scenes]
     captions = [
-        ", ".join(
-            [view[0].name, *(f"{name} {v.psnr:.2f} dB" for (name, _), v in zip(scenes, view, strict=True))]
-        )
-        for view in zip(*scores, strict=True)
+        ", ".join([view.name, *(f"{n} {p:.2f} dB" for n, p in zip(names, view.psnrs, strict=True))])
+        for view in drawn
     ]
-    labels = [TARGET, *labels_of([name for name, _ in scenes], [len(splats) for _, splats in scenes])]
+    labels = [TARGET, *labels_of(names, [len(splats) for _, splats in scenes])]
     write_png(path, contact_sheet(rows, labels, row_labels=captions), overwrite=True)
 
 

@@ -2,11 +2,12 @@
 
 import base64
 import json
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
 from io import BytesIO
 from pathlib import Path
+from urllib.parse import quote
 
 import numpy as np
 from numpy.typing import NDArray
@@ -86,6 +87,22 @@ class Page:
         kind = ' class="warns"' * warns
         self._parts.append(f"<p{kind}>{escape(text)}</p>")
 
+    def links(self, files: Mapping[str, str], text: str = "") -> None:
+        """Add a line of links to files beside the page, by their texts."""
+        links = (f'<a href="{escape(quote(file))}">{escape(name)}</a>' for name, file in files.items())
+        self._parts.append(f"<p>{escape(text)}{', '.join(links)}</p>")
+
+    def code(self, lines: Iterable[str]) -> None:
+        """Add lines of code."""
+        text = escape("\n".join(lines))
+        self._parts.append(f'<div class="scroll"><pre>{text}</pre></div>')
+
+    def details(self, title: str, rows: Sequence[Sequence[str]]) -> None:
+        """Add a table of two columns that opens on a click."""
+        self._parts.append(f"<details><summary>{escape(title)}</summary>")
+        self.table(("name", "value"), rows)
+        self._parts.append("</details>")
+
     def table(
         self, columns: Sequence[str], rows: Sequence[Sequence[str]], best: Collection[tuple[int, int]] = ()
     ) -> None:
@@ -110,8 +127,10 @@ class Page:
             f"<figcaption>{text}</figcaption></figure>"
         )
 
-    def comparison(self, title: str, target: NDArray[np.uint8], shown: Sequence[Shown]) -> None:
-        """Add a view: a slider between the target and any rendering, and magnified crops of each.
+    def comparison(
+        self, title: str, target: NDArray[np.uint8], shown: Sequence[Shown], name: str = TARGET
+    ) -> None:
+        """Add a view: a slider between the target, with a `name`, and any rendering, and magnified crops.
 
         The first rendering is shown initially, and its worst regions are magnified. Crops keep the resolution
         of the given images; whole images are shrunk.
@@ -129,7 +148,7 @@ class Page:
             f'height:{down:.2%}"></i>'
             for k, (left, top, across, down) in enumerate(windows)
         )
-        named = [Shown(TARGET, target), *shown]
+        named = [Shown(name, target), *shown]
         crops = [
             f'<div class="crops r{k % 2}">{"".join(self._crop(one, w) for one in named)}</div>'
             for k, w in enumerate(windows)
@@ -138,9 +157,9 @@ class Page:
             f'<section class="view"><h4>{escape(title)}</h4>'
             f'<div class="pair" style="width:calc(85vh*{width / height:.4f})">'
             f'<div class="slider" style="aspect-ratio:{width}/{height}">'
-            f'<img data-i="{number}" alt="{TARGET}"><img class="over" data-i="{numbers[0]}" alt="rendering">'
-            f'{marks}<span class="tag left">{TARGET}</span><span class="tag right"></span>'
-            f'<input type="range" min="0" max="100" value="50" aria-label="{TARGET} or rendering"></div>'
+            f'<img data-i="{number}" alt="{name}"><img class="over" data-i="{numbers[0]}" alt="rendering">'
+            f'{marks}<span class="tag left">{name}</span><span class="tag right"></span>'
+            f'<input type="range" min="0" max="100" value="50" aria-label="{name} or rendering"></div>'
             f'<label class="pick">right: <select>{options}</select></label></div>'
             f'<div class="parts">{"".join(crops)}</div></section>'
         )

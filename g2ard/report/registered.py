@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from g2ard.config.choices import Colour
 from g2ard.errors import InputError
 from g2ard.io.images import load_photo, to_bytes
-from g2ard.io.labels import RESULT
 from g2ard.progress import plural
 from g2ard.rendering.renderer import Renderer
 from g2ard.report.page import Page, Shown
@@ -47,10 +46,10 @@ def registration_report(
     page = Page(title, f"{plural(len(cameras), 'photo')} against {plural(len(scene), 'Gaussian')}")
     for line in told:
         page.paragraph(line)
-    page.table(
-        ["photo", "status", "ZNCC", "σ position", "σ rotation, °", "error", "error, °", "why"],
-        [_cells(row) for row in found.report.photos],
-    )
+    columns = ["photo", "status", "ZNCC", "σ position", "σ rotation, °", "error", "error, °", "why"]
+    table = [columns, *map(_cells, found.report.photos)]
+    names, *cells = zip(*(column for column in zip(*table, strict=True) if any(column[1:])), strict=True)
+    page.table(names, cells)
     page.heading("Least alike first")
     rows = found.report.photos
     seen = [i for i, row in enumerate(rows) if row.camera_from_world is not None]
@@ -63,10 +62,10 @@ def registration_report(
             continue  # deleted since it was registered
         render = to_bytes(renderer.image(replace(one[0], viewmat=np.array(row.camera_from_world))))
         alike = "kept at its start" if row.zncc is None else f"ZNCC {row.zncc:.2f}"
-        shown = [Shown(RESULT, render, alike)]
+        shown = [Shown("render", render, alike)]
         if row.name in starts:
             shown.append(Shown("start", to_bytes(renderer.image(replace(one[0], viewmat=starts[row.name])))))
-        page.comparison(f"{row.name}: {row.status}", photo, shown)
+        page.comparison(f"{row.name}: {row.status}", photo, shown, "photo")
         matches = found.matches.get(row.name)
         if matches is not None:
             scale = photo.shape[1] / cameras.take([i]).resized(side)[0].width
@@ -95,7 +94,7 @@ def _matches_drawn(
 
 def _cells(row: PhotoReport) -> list[str]:
     def number(value: float | None) -> str:
-        return "–" if value is None else f"{value:.3g}"
+        return "" if value is None else f"{value:.3g}"
 
     sigma = (None, None) if row.sigma is None else (row.sigma.position, row.sigma.rotation)
     error = (None, None) if row.error is None else (row.error.position, row.error.rotation)

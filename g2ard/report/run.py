@@ -234,10 +234,10 @@ class RunReport(Report):
     @property
     def sizes(self) -> str:
         """Sizes of the dense scene, except points found in photos, and of the result."""
-        before, after, file = ((self.bytes[name] or 0) / 1e6 for name in ("input", "output", "file"))
+        before, output, file = ((self.bytes[name] or 0) / 1e6 for name in ("input", "output", "file"))
         start = "" if self.photos else f"{before:.2f} → "
         if self.packed is None:
-            return f"{start}{after:.2f} MB as .ply"
+            return f"{start}{file or output:.2f} MB as .ply"
         start = start.replace(" → ", " MB as .ply → ")
         return f"{start}{file:.2f} MB as .{self.packed.file.partition('.')[2]}"
 

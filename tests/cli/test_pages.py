@@ -6,6 +6,7 @@ from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from PIL import Image
 
@@ -107,6 +108,43 @@ def test_messages_have_the_words_of_pages(command: str, made: Path, command_line
     assert OTHER_WORDS.findall(told) == []
 
 
+def test_a_report_opens_with_the_size_and_links_and_says_what_next(made: Path) -> None:
+    run = made / "run"
+    page = (run / "report.html").read_text(encoding="utf-8")
+    top, rest = page.split('class="slider"', 1)
+    size = f"{(run / 'scene.ply').stat().st_size / 1e6:.2f} MB"
+    assert f"{size} as .ply: " in top
+    links = re.findall(r'href="([^"]+)"', top)
+    assert links == ["scene.ply", "view.html", "."]
+    assert all((run / link).exists() for link in links)
+    assert f"<pre>g2ard {PAGES['run/view.html'][0]}</pre>" in rest
+    assert ">recover.seed<" in rest  # the settings
+    assert re.findall(r"g2ard (\w+) scene\.ply", rest) == ["distill", "lod", "adapt"]
+
+
+def test_the_preview_is_large_whatever_the_views_are(made: Path, of_photos: tuple[Path, str]) -> None:
+    for run in (made / "run", of_photos[0]):
+        with Image.open(run / "preview.png") as found:
+            assert 1200 <= found.width < 3000
+
+
+def test_a_registration_shows_photos_and_renders(made: Path) -> None:
+    page = (made / "page.html").read_text(encoding="utf-8")
+    assert set(re.findall(r"<figcaption>(\w+)</figcaption>", page)) == {"photo", "render", "start"}
+    assert 'class="tag left">photo<' in page
+    rows = re.findall(r"<tr>(<td.*?)</tr>", page)
+    for column in set(re.findall(r'data-column="([^"]+)"', page)):
+        assert any(re.search(rf'data-column="{re.escape(column)}">[^<]', row) for row in rows)
+
+
+def test_one_view_is_rendered_to_a_picture(made: Path, command_line: CommandLine) -> None:
+    for name, options in (("one.png", ["-k", "1", "--size", "90x60"]), ("best.png", ["--size", "90x60"])):
+        succeeds(command_line, made, "render", "ball.ply", *options, "-o", name)
+        with Image.open(made / name) as found:
+            assert found.size == (90, 60)
+            assert np.asarray(found).std() > 5
+
+
 @pytest.fixture(scope="module")
 def of_photos(tmp_path_factory: pytest.TempPathFactory, command_line: CommandLine) -> tuple[Path, str]:
     """Return the folder of a run from photos alone, and what it printed."""
@@ -130,7 +168,7 @@ def test_photos_alone_show_the_photo_beside_the_result(of_photos: tuple[Path, st
         assert f"→ {size}" not in line  # the first points are no larger scene
     assert Text(run / "view.html").labels == ["result: run, 200 Gaussians"]
     with Image.open(run / "preview.png") as found:
-        assert found.width < 3 * 64  # two photos of 64 pixels beside each other
+        assert found.width < 1400  # two photos of 64 pixels beside each other, enlarged
 
 
 CLOUD_COMMANDS = [

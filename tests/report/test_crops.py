@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from g2ard.io.images import to_bytes
 from g2ard.rendering.targets import TeacherRenders
 from g2ard.report import distilled
 from g2ard.report.page import Page, Shown, pixels, worst_windows
@@ -87,13 +88,17 @@ def test_the_preview_has_the_scores_of_the_table_and_greys_what_is_not_scored(
     targets = TeacherRenders(ball, cameras)
     monkeypatch.setattr(targets, "mask", lambda view: mask, raising=False)
     half = ball.take(range(100))
-    distilled.preview(tmp_path / "preview.png", targets, [("half", half)])
+    scenes = [("half", half)]
+    renderers = list(distilled.renderers_of(scenes).values())
+    drawn = [distilled.pictures(targets, view, renderers) for view in range(2)]
+    distilled.preview(tmp_path / "preview.png", drawn, scenes)
     rows, captions = shown
     table = evaluate(half, targets)
     assert captions == [f"{view.name}, half {view.psnr:.2f} dB" for view in table.views]
     for image in (image for row in rows for image in row):
-        assert (image[~mask] == 0.5).all()
-    np.testing.assert_array_equal(rows[1][0][mask], targets[1][mask])
+        assert image.shape == (19 * 24, 19 * 32, 3)  # two make more than 1,200 pixels
+        assert (image[::19, ::19][~mask] == 128).all()
+    np.testing.assert_array_equal(rows[1][0][::19, ::19][mask], to_bytes(targets[1][mask]))
 
 
 @pytest.mark.parametrize("width", [20, 60, 400])

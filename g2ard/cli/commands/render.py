@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
     from g2ard.rendering.renderer import Rendered
 
-_NO_FOLDER = (".png", ".jpg", ".jpeg", ".avi", ".mov", ".mkv", ".webm")
+_NO_FOLDER = (".jpg", ".jpeg", ".avi", ".mov", ".mkv", ".webm")
 """Suffixes of files that `render` does not write as -o."""
 
 _PANORAMA = 2048
@@ -47,7 +47,8 @@ def render(
             "-o",
             "--output",
             metavar="DIR|FILE",
-            help="Folder for PNGs, or an animation of the views in order: .gif, .webp, .mp4 (needs ffmpeg).",
+            help="Folder for PNGs, one view as .png, or an animation of the views in order: .gif, .webp, "
+            ".mp4 (needs ffmpeg).",
         ),
     ] = None,
     views: opt.ViewsOrMadeOption = None,
@@ -84,7 +85,7 @@ def render(
     up: opt.UpOption = None,
 ) -> None:
     """Render views of a scene as PNG or as an animation."""
-    from g2ard.io.images import to_bytes, write_animation
+    from g2ard.io.images import to_bytes, write_animation, write_png
     from g2ard.jobs.inputs import GivenViews, load_views
     from g2ard.jobs.run_views import at_size, is_planned, looks_at, orbit, planned_at, views_or_pool
     from g2ard.jobs.view_checks import warn_of_sight
@@ -94,12 +95,21 @@ def render(
         raise typer.BadParameter("give -o DIR, --sheet FILE.png or both")
     if turn is not None and (views is not None or looks is not None):
         raise typer.BadParameter("--orbit generates its views, so it excludes --views and -k")
-    output, animation = _folder_or_animation(run, output, depth)
+    output, file = _folder_or_file(run, output, depth)
+    single = file is not None and file.suffix.lower() == ".png"
+    if single and views is None and turn is None:
+        looks = looks or 1
+
+    def check_single(count: int) -> None:
+        if file is not None and single and count > 1:
+            raise typer.BadParameter(f"-o: {file.name} holds one view, not {count}; give -k 1 or a folder")
+
+    check_single(turn or looks or 1)
     if looks is not None and views is not None and not is_made(views):
         raise typer.BadParameter("-k generates views, so it excludes --views; give one")
     if views is not None and not is_made(views):
         run.refuse_typed("without generated views", "up")
-    if animation is None:
+    if file is None or single:
         run.refuse_typed("without an animation", "fps")
     if size is not None and len(size) > 1 and (around or (views is not None and not is_made(views))):
         what = "panoramas are twice as wide as high" if around else "given views keep their shape"
@@ -123,6 +133,7 @@ def render(
     else:
         cameras = at_size(cameras, size, made=is_planned(found))
         warn_of_sight(splats, cameras, run.say)
+    check_single(len(cameras))
     places = output_names(cameras.source or str(views), cameras.names) if output is not None else []
     if output is not None:
         run.claim("--output", *(file for place in places for file in _files(output / place, depth)))
@@ -147,14 +158,17 @@ def render(
             run.progress("render", view + 1, len(cameras))
             yield pixels
 
-    if animation is not None:
-        write_animation(animation, draw(None), fps=fps, overwrite=run.overwrite)
-        run.kept.append(f"{animation} is written")
+    if file is not None:
+        if single:
+            write_png(file, next(draw(None)), overwrite=run.overwrite)
+        else:
+            write_animation(file, draw(None), fps=fps, overwrite=run.overwrite)
+        run.kept.append(f"{file} is written")
     else:
         with nullcontext() if output is None else atomic_folder(output, run.overwrite) as folder:
             deque(draw(folder), maxlen=0)
     run.kept += [f"{output} is written"] if output is not None else []
-    written = [str(path) for path in (output, animation) if path]
+    written = [str(path) for path in (output, file) if path]
     if sheet is not None:
         with run.showing("--sheet") if written else run.finishing("--sheet"):
             _write_sheet(sheet, shown, cameras.names, run.overwrite)
@@ -163,22 +177,23 @@ def render(
     run.result({"images": len(cameras), "output": written[0]})
 
 
-def _folder_or_animation(run: Run, output: Path | None, depth: bool) -> tuple[Path | None, Path | None]:
-    """Check the output, and return it as a folder or as an animation's file."""
+def _folder_or_file(run: Run, output: Path | None, depth: bool) -> tuple[Path | None, Path | None]:
+    """Check the output, and return it as a folder or as the file of a picture or an animation."""
     from g2ard.io.images import ANIMATIONS, check_animation
 
     if output is None:
         return None, None
     run.claim("--output", output)
-    if output.suffix.lower() not in ANIMATIONS:
+    if output.suffix.lower() not in (".png", *ANIMATIONS):
         if output.suffix.lower() in _NO_FOLDER:
-            raise typer.BadParameter(f"-o: expected a folder, .gif, .webp or .mp4, got {output.name!r}")
+            raise typer.BadParameter(f"-o: expected a folder, .png, .gif, .webp or .mp4, got {output.name!r}")
         check_output(output, run.overwrite, folder=True)
         return output, None
     if depth:
         raise typer.BadParameter("--depth needs a folder; give -o DIR")
     check_output(output, run.overwrite)
-    check_animation(output)
+    if output.suffix.lower() != ".png":
+        check_animation(output)
     return None, output
 
 
