@@ -3,11 +3,12 @@
 import math
 import re
 from collections.abc import Iterator
-from itertools import product, repeat
+from itertools import repeat
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.lib.recfunctions import structured_to_unstructured, unstructured_to_structured
 from numpy.typing import NDArray
 
 from g2ard.config.choices import RenderModel
@@ -36,20 +37,25 @@ _SCALE_LIMIT = 20.0
 """Log-scales are clamped to ±20, as in SuperSplat, since an outlier would coarsen its chunk."""
 
 _VECTOR_BITS = 11, 10, 11  # bits of the three components of a position or scale
+_BOUNDS = [
+    f"{end}_{name}"
+    for names in (("x", "y", "z"), ("scale_x", "scale_y", "scale_z"), ("r", "g", "b"))
+    for end in ("min", "max")
+    for name in names
+]
+"""Bounds of a chunk: of positions, log-scales and colours."""
+
 _PACKED = ["packed_position", "packed_rotation", "packed_scale", "packed_color"]
 
 
 class Stream(RawStream):
-    """Scene in blocks; memory holds all chunk bounds, 72 bytes per 256 Gaussians."""
+    """Scene in blocks; memory holds all chunk bounds, 144 bytes per 256 Gaussians."""
 
     def __init__(self, path: Path) -> None:
         header = plyfiles.read_header(path)
         plyfiles.require(path, header.properties("vertex"), _PACKED, "a compressed scene")
         chunk_properties = header.properties("chunk")
-        bounds = [f"{end}_{axis}" for end in ("min", "max") for axis in ("x", "y", "z")]
-        bounds += [f"{end}_scale_{axis}" for end in ("min", "max") for axis in ("x", "y", "z")]
-        if "min_r" in chunk_properties:
-            bounds += [f"{end}_{channel}" for end in ("min", "max") for channel in "rgb"]
+        bounds = _BOUNDS if "min_r" in chunk_properties else _BOUNDS[:12]  # older files: colours over [0, 1]
         plyfiles.require(path, chunk_properties, bounds, "a compressed scene", "chunk")
         rest = [p for p in header.properties("sh") if re.fullmatch(r"f_rest_\d+", p)]
         if len(rest) not in (0, 9, 24, 45) or set(rest) != {f"f_rest_{k}" for k in range(len(rest))}:
@@ -70,7 +76,9 @@ class Stream(RawStream):
         self.up = plyfiles.up_of(header.comments)
         self.restore(plyfiles.axes_of(path, header))
         self._vertex, self._sh, self._rest = vertex, sh[0] if sh else None, len(rest) // 3
-        self._chunk, self._colored = np.array(chunk), "min_r" in chunk_properties
+        self._bounds = np.tile([[0.0] * 3, [1.0] * 3], (len(chunk), 3, 1, 1))
+        stored = structured_to_unstructured(np.asarray(chunk)[bounds]).reshape(len(chunk), -1, 2, 3)
+        self._bounds[:, : len(bounds) // 6] = stored
 
     def raw(self, rows: int, start: int) -> Iterator[Raw]:
         bands: Iterator[Any] = repeat((0, None))
@@ -81,32 +89,27 @@ class Stream(RawStream):
             yield self._decode(first, vertex, sh)
 
     def _decode(self, first: int, vertex: Values, sh: Values | None) -> Raw:
-        raw, chunk, rest = Raw.empty(len(vertex), self._rest), self._chunk, self._rest
-        of = np.arange(first, first + len(vertex)) // _CHUNK_ROWS
+        raw = Raw.empty(len(vertex), self._rest)
         position, rotation, scale, color = (vertex[name] for name in _PACKED)
-        raw.means[:] = _between(chunk, of, "{}_{}", "xyz", _unpacked(position, _VECTOR_BITS))
-        raw.log_scales[:] = _between(chunk, of, "{}_scale_{}", "xyz", _unpacked(scale, _VECTOR_BITS))
+        means, scales, colors = self._bounds.swapaxes(0, 1)
+        raw.means[:] = _between(means, first, _unpacked(position, _VECTOR_BITS))
+        raw.log_scales[:] = _between(scales, first, _unpacked(scale, _VECTOR_BITS))
         others = (_unpacked(rotation, (10, 10, 10)) - 0.5) * np.sqrt(2)
         raw.quats[:] = from_smallest_three(rotation >> np.uint32(30), others)
         color = _unpacked(color, (8, 8, 8, 8))
-        rgb = color[:, :3]
-        if self._colored:  # older files quantise colour over [0, 1] instead
-            rgb = _between(chunk, of, "{}_{}", "rgb", rgb)
-        raw.sh0[:, 0] = (rgb - 0.5) / SH_C0
+        raw.sh0[:, 0] = (_between(colors, first, color[:, :3]) - 0.5) / SH_C0
         raw.logit_opacities[:] = logits_of(color[:, 3])
         if sh is not None:
-            for k, channel in product(range(rest), range(3)):
-                raw.shN[:, k, channel] = _coefficient(sh[f"f_rest_{channel * rest + k}"])
+            codes = structured_to_unstructured(sh[[f"f_rest_{k}" for k in range(3 * self._rest)]])
+            raw.shN[:] = _coefficient(codes).reshape(len(sh), 3, -1).swapaxes(1, 2)
         return raw
 
 
-def _between(chunk: Values, of: Values, pattern: str, axes: str, t: Float) -> Float:
-    """Interpolate by `t` between the bounds of each Gaussian's chunk."""
-    low, high = (
-        np.stack([chunk[pattern.format(end, axis)][of].astype(np.float64) for axis in axes], axis=1)
-        for end in ("min", "max")
-    )
-    return low * (1 - t) + high * t
+def _between(bounds: Values, first: int, t: Float) -> Float:
+    """Interpolate by `t` between the (chunks, 2, 3) bounds of each Gaussian's chunk, from row `first` on."""
+    chunks = np.arange(first, first + len(t)) // _CHUNK_ROWS
+    low, high = bounds[chunks].astype(np.float64).swapaxes(0, 1)
+    return np.asarray(low * (1 - t) + high * t)
 
 
 def _coefficient(codes: Values) -> Float:
@@ -128,40 +131,35 @@ def write(path: Path, splats: Splats, *, overwrite: bool = False) -> float:
     given = given.take(packing_order(given.means, _CHUNK_ROWS))
     error = rounding(given, given.narrowed())
     splats = as_stored(given)
-    bounds: dict[str, Float32] = {}
     words = np.empty(len(splats), [(name, "<u4") for name in _PACKED])
-    words["packed_position"] = _packed(_within(bounds, "", "xyz", splats.means), _VECTOR_BITS)
+    means, shares = _within(splats.means)
+    words["packed_position"] = _packed(shares, _VECTOR_BITS)
     largest, others = smallest_three(unit_quats(splats.quats))
     rotations = _packed(others / math.sqrt(2) + 0.5, (10, 10, 10))
     words["packed_rotation"] = largest.astype(np.uint32) << np.uint32(30) | rotations
-    logs = np.clip(log_scales(splats), -_SCALE_LIMIT, _SCALE_LIMIT)
-    words["packed_scale"] = _packed(_within(bounds, "scale_", "xyz", logs), _VECTOR_BITS)
-    color = _within(bounds, "", "rgb", splats.colors)
-    words["packed_color"] = _packed(np.column_stack([color, splats.opacities]), (8, 8, 8, 8))
-    chunk = np.empty(math.ceil(len(splats) / _CHUNK_ROWS), [(name, "<f4") for name in bounds])
-    for name, values in bounds.items():
-        chunk[name] = values
+    scales, shares = _within(np.clip(log_scales(splats), -_SCALE_LIMIT, _SCALE_LIMIT))
+    words["packed_scale"] = _packed(shares, _VECTOR_BITS)
+    colors, shares = _within(splats.colors)
+    words["packed_color"] = _packed(np.column_stack([shares, splats.opacities]), (8, 8, 8, 8))
+    bounds = np.concatenate([means, scales, colors], axis=1).reshape(len(means), -1)
+    chunk = unstructured_to_structured(bounds, np.dtype([(name, "<f4") for name in _BOUNDS]))
     elements = [PlyElement.describe(chunk, "chunk"), PlyElement.describe(words, "vertex")]
     if splats.sh_degree:
         elements.append(PlyElement.describe(_harmonics(splats), "sh"))
     comments = plyfiles.comments_of(splats)
     with atomic_output(path, overwrite) as temporary, temporary.open("wb") as file:
         PlyData(elements, byte_order="<", comments=comments).write(file)
-    of, shares = np.arange(len(splats)) // _CHUNK_ROWS, _unpacked(words["packed_position"], _VECTOR_BITS)
-    return error + rounding(splats, _between(chunk, of, "{}_{}", "xyz", shares) + splats.offset)
+    stored = _between(means, 0, _unpacked(words["packed_position"], _VECTOR_BITS))
+    return error + rounding(splats, stored + splats.offset)
 
 
-def _within(bounds: dict[str, Float32], what: str, axes: str, values: Values) -> Float:
-    """Scale values to [0, 1] within their chunk, and add the chunk's bounds to `bounds`."""
+def _within(values: Values) -> tuple[Float32, Float]:
+    """Return the (chunks, 2, 3) bounds of the values of chunks, and values scaled to [0, 1] within them."""
     starts = np.arange(0, len(values), _CHUNK_ROWS)
-    low = np.minimum.reduceat(values, starts).astype(np.float32)
-    high = np.maximum.reduceat(values, starts).astype(np.float32)
-    for end, side in (("min", low), ("max", high)):
-        for k, axis in enumerate(axes):
-            bounds[f"{end}_{what}{axis}"] = side[:, k]
-    of = np.arange(len(values)) // _CHUNK_ROWS
-    wide = high.astype(np.float64)[of] - low[of]
-    return (values - low.astype(np.float64)[of]) / np.where(wide > 0, wide, 1.0)
+    ends = [limit.reduceat(values, starts).astype(np.float32) for limit in (np.minimum, np.maximum)]
+    low, high = (end.astype(np.float64)[np.arange(len(values)) // _CHUNK_ROWS] for end in ends)
+    wide = high - low
+    return np.stack(ends, axis=1), (values - low) / np.where(wide > 0, wide, 1.0)
 
 
 def _packed(values: Float, bits: tuple[int, ...]) -> NDArray[np.uint32]:
@@ -184,9 +182,7 @@ def _unpacked(words: Values, bits: tuple[int, ...]) -> Float:
 
 def _harmonics(splats: Splats) -> Values:
     """Quantise coefficients in [−4, 4] to bytes, channel-major."""
-    rest = splats.shN.shape[1]
-    rows = np.empty(len(splats), [(f"f_rest_{k}", "u1") for k in range(3 * rest)])
-    for k in range(3 * rest):
-        codes = np.floor((splats.shN[:, k % rest, k // rest].astype(np.float64) / 8 + 0.5) * 256)
-        rows[f"f_rest_{k}"] = np.clip(codes, 0, 255)
-    return rows
+    values = splats.shN.swapaxes(1, 2).reshape(len(splats), -1).astype(np.float64)
+    codes = np.clip(np.floor((values / 8 + 0.5) * 256), 0, 255).astype(np.uint8)
+    names = [(f"f_rest_{k}", "u1") for k in range(codes.shape[1])]
+    return unstructured_to_structured(codes, np.dtype(names))
