@@ -4,13 +4,13 @@ from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from g2ard.io import Source, read_view_set
 from g2ard.io.detect import run_scene
 from g2ard.io.images import colour_text, photo_traits
+from g2ard.io.jsonfile import Json
 from g2ard.io.sog import chunks_of
 from g2ard.io.splits import splits_of
 from g2ard.io.types import Note, Points, Values, ViewFiles, ViewSet
@@ -22,9 +22,7 @@ from g2ard.scene.splats import Splats
 _QUANTILES = (0, 1, 25, 50, 75, 99, 100)
 
 
-def describe(
-    given: str | Path | ViewFiles, more: Callable[[Splats], dict[str, Any]] | None = None
-) -> dict[str, Any]:
+def describe(given: str | Path | ViewFiles, more: Callable[[Splats], Json] | None = None) -> Json:
     """Summarise a scene, point cloud or views.
 
     Args:
@@ -84,7 +82,7 @@ def _extent(positions: Values) -> dict[str, list[float]]:
     }
 
 
-def _splats(splats: Splats) -> dict[str, Any]:
+def _splats(splats: Splats) -> Json:
     scales = np.sort(splats.scales, axis=1)
     opacities = splats.opacities
     unique = len(np.unique(np.ascontiguousarray(splats.means).view(f"V{3 * splats.means.itemsize}")))
@@ -108,7 +106,7 @@ def _splats(splats: Splats) -> dict[str, Any]:
     }
 
 
-def _points(points: Points) -> dict[str, Any]:
+def _points(points: Points) -> Json:
     return {
         "count": len(points),
         "extent": _extent(points.positions),
@@ -120,7 +118,7 @@ def _points(points: Points) -> dict[str, Any]:
     }
 
 
-def _views(views: ViewSet) -> dict[str, Any]:
+def _views(views: ViewSet) -> Json:
     cameras = views.cameras
     sizes = Counter(f"{w}×{h}" for w, h in zip(cameras.widths, cameras.heights, strict=True))
     return {

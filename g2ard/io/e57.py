@@ -18,7 +18,7 @@ from g2ard.io.paths import check_unpacked, file_identity, user_cache
 from g2ard.io.photos import Frame, Lens, Listed, inverse, posed
 from g2ard.io.stream import JoinedClouds, MarkedPoints, Names, PointStream, telling
 from g2ard.io.transforms import FLIP
-from g2ard.io.types import Float, Note, ViewFiles
+from g2ard.io.types import Float, Note, Notes, ViewFiles
 from g2ard.progress import plural
 from g2ard.scene.lenses import PhotoLens
 from g2ard.scene.transform import rotation_matrices
@@ -57,7 +57,7 @@ class Stream(JoinedClouds):
     def identity(self) -> list[Any]:
         return file_identity([self.path])
 
-    def header_notes(self) -> tuple[Note, ...]:
+    def header_notes(self) -> Notes:
         found: dict[str, list[Note]] = {}
         for number, scan in enumerate(self.streams):
             part = f"scan {number}: " if len(self.streams) > 1 else ""
@@ -101,7 +101,7 @@ class _Scan(PointStream):
             white = next((scale for scale in scales if scale >= stated[1]), full)
             self._range = dark, full if full == 255 or full > white else white
 
-    def header_notes(self) -> tuple[Note, ...]:
+    def header_notes(self) -> Notes:
         scaled = ("eight_bit_colors", "color_range")  # fields have no range of their own
         return tuple(note for note in super().header_notes() if note.code not in scaled)
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from urllib.parse import unquote
 
 if TYPE_CHECKING:
-    from g2ard.io.types import Note
+    from g2ard.io.types import Notes
 
 _READ = ".png .jpg .jpeg .jpe .jfif .webp .tif .tiff .bmp .gif .ppm .pgm .pnm .tga .jp2"
 _PHOTO_SUFFIXES = tuple(_READ.split())
@@ -70,7 +70,7 @@ class Finder:
         notes: a note if `among` chose a folder where photos were not expected.
     """
 
-    def __init__(self, *folders: Path, notes: tuple[Note, ...] = ()) -> None:
+    def __init__(self, *folders: Path, notes: Notes = ()) -> None:
         self._folders, self.notes = tuple(dict.fromkeys(folders)), notes
         self._listings: dict[Path, tuple[dict[str, Path], dict[str, Path]]] = {}
 

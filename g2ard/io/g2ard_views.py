@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import msgspec
 import numpy as np
@@ -13,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from g2ard.errors import InputError
 from g2ard.io.finding import Finder
-from g2ard.io.jsonfile import Matrix, Number, Place, Pose, Weight, Whole, checked, read_own
+from g2ard.io.jsonfile import Json, Matrix, Number, Place, Pose, Weight, Whole, checked, read_own
 from g2ard.io.paths import beside
 from g2ard.io.photos import Frame, Lens, Listed, rigid
 from g2ard.io.types import Float, ViewFiles
@@ -94,7 +93,7 @@ def _exact(stored: Float, place: Place) -> Float:
     return stored if len(stored) == 4 and np.allclose(nearest, stored, rtol=0, atol=1e-9) else nearest
 
 
-def _written(lens: PhotoLens | None) -> dict[str, Any] | None:
+def _written(lens: PhotoLens | None) -> Json | None:
     if lens is None:
         return None
     turn = np.array(lens.turn).reshape(3, 3).tolist()
@@ -113,7 +112,7 @@ def text_of(path: Path, cameras: Cameras, splits: Sequence[str | None], weights:
         )
     lines = []
     for i in range(count):
-        view: dict[str, Any] = {
+        view: Json = {
             "name": cameras.names[i],
             "width": int(cameras.widths[i]),
             "height": int(cameras.heights[i]),

@@ -24,7 +24,7 @@ from g2ard.config.choices import AXES, Axes
 from g2ard.errors import InputError, damaged, require
 from g2ard.io import judge, spz
 from g2ard.io.atomic import atomic_output
-from g2ard.io.jsonfile import Number, Place, Row, Vector, Whole, checked, parse_json
+from g2ard.io.jsonfile import Json, Number, Place, Row, Vector, Whole, checked, parse_json
 from g2ard.io.packing import packing_order, rounding, unit_quats, writable
 from g2ard.io.paths import check_regular, decoded
 from g2ard.io.sanitize import Raw, cleaned
@@ -88,8 +88,8 @@ def write(path: Path, splats: Splats, *, overwrite: bool = False, compress: str 
 def _plain(path: Path, splats: Splats) -> list[bytes]:
     """Return the parts of a .glb with float32 attributes."""
     attributes = _attributes(splats)
-    views: list[dict[str, Any]] = []
-    accessors: list[dict[str, Any]] = []
+    views: list[Json] = []
+    accessors: list[Json] = []
     blobs, start = [], 0
     for name, values in attributes.items():
         blob = values.tobytes()
@@ -108,7 +108,7 @@ def _plain(path: Path, splats: Splats) -> list[bytes]:
         accessors.append(accessor)
         blobs.append(blob)
         start += len(blob)
-    node: dict[str, Any] = {"mesh": 0}
+    node: Json = {"mesh": 0}
     if splats.offset.any():
         node["translation"] = (splats.offset * _GLTF_TURN).tolist()
     node |= _extras(splats)
@@ -131,7 +131,7 @@ def spz_glb(path: Path, splats: Splats, centre: Float | None = None) -> tuple[li
     names = {"POSITION": "VEC3", "COLOR_0": "VEC4"}
     names |= {f"{EXTENSION}:SCALE": "VEC3", f"{EXTENSION}:ROTATION": "VEC4"}
     names |= {name: "VEC3" for name, _ in _harmonics(splats.sh_degree)}
-    accessors: list[dict[str, Any]] = [
+    accessors: list[Json] = [
         {"componentType": _FLOAT, "count": len(splats), "type": kind} for kind in names.values()
     ]
     accessors[0] |= ends
@@ -149,7 +149,7 @@ def spz_glb(path: Path, splats: Splats, centre: Float | None = None) -> tuple[li
     return _glb(path, document, [blob]), spz.rounding(means, bits)
 
 
-def _extras(splats: Splats) -> dict[str, Any]:
+def _extras(splats: Splats) -> Json:
     """Return what a node states of a scene that is turned: the axes of its coordinates."""
     return {} if splats.axes == "RDF" else {"extras": {"g2ard": {"axes": splats.axes}}}
 
@@ -163,7 +163,7 @@ def _about_y(splats: Splats) -> Splats:
     )
 
 
-def _glb(path: Path, document: dict[str, Any], blobs: list[bytes]) -> list[bytes]:
+def _glb(path: Path, document: Json, blobs: list[bytes]) -> list[bytes]:
     start = sum(map(len, blobs))
     text = json.dumps(document, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 4)
@@ -202,12 +202,10 @@ def _harmonics(degree: int) -> list[tuple[str, int]]:
     ]
 
 
-def _document(
-    node: dict[str, Any], names: list[str], views: list[Any], accessors: list[Any], size: int
-) -> dict[str, Any]:
+def _document(node: Json, names: list[str], views: list[Any], accessors: list[Any], size: int) -> Json:
     from g2ard._core import __version__
 
-    splatting: dict[str, Any] = {
+    splatting: Json = {
         "kernel": "ellipse",
         "colorSpace": "srgb_rec709_display",
         "projection": "perspective",
@@ -236,15 +234,15 @@ _Entry = TypeVar("_Entry")
 
 class _Primitive(msgspec.Struct):
     mode: Any = 4  # triangles
-    attributes: dict[str, Any] = {}
-    extensions: dict[str, Any] = {}
+    attributes: Json = {}
+    extensions: Json = {}
 
 
 class _Splatting(msgspec.Struct, rename="camel"):
     kernel: Any = "ellipse"
     color_space: Any = None
     quantized_position_scale: Any = 1
-    extensions: dict[str, Any] = {}
+    extensions: Json = {}
 
 
 class _Mesh(msgspec.Struct):
@@ -293,7 +291,7 @@ class _Document(msgspec.Struct, rename="camel"):
     nodes: list[_Node] = []
     accessors: list[_Accessor] = []
     buffer_views: list[_View] = []
-    buffers: list[dict[str, Any]] = []
+    buffers: list[Json] = []
 
 
 def read(path: Path) -> Noted:
@@ -423,7 +421,7 @@ def _primitive(within: Place, document: _Document, binary: bytes, primitive: _Pr
     return scene, (*notes, *own)
 
 
-def _attributes_of(place: Place, document: _Document, binary: bytes, names: dict[str, Any]) -> Noted:
+def _attributes_of(place: Place, document: _Document, binary: bytes, names: Json) -> Noted:
     """Read the float or integer attributes of a primitive, in the axes of a .ply."""
 
     def values(name: str, width: int) -> Float32:

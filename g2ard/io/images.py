@@ -26,7 +26,7 @@ from g2ard.io.atomic import atomic_output
 from g2ard.io.finding import MOVING, files_in
 from g2ard.io.jsonfile import Place, Row, checked, read_json
 from g2ard.io.photos import fits, opened_image, photo_size, turns
-from g2ard.io.types import Bytes, Float, Float32, Mask, Values
+from g2ard.io.types import Bytes, Float, Float32, Mask, Size, Values
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.lenses import PhotoLens
 from g2ard.scene.samples import evenly_spaced
@@ -100,12 +100,12 @@ class PhotoTraits:
 
     alpha: int
     border: Colour | None
-    sizes: Mapping[tuple[int, int], int]
+    sizes: Mapping[Size, int]
 
 
 def photo_traits(files: Sequence[Path]) -> PhotoTraits:
     """Look at the headers of all photos and the borders of a few; unreadable photos are ignored."""
-    sizes: Counter[tuple[int, int]] = Counter()
+    sizes: Counter[Size] = Counter()
     alpha = 0
     for photo in files:
         with suppress(InputError), opened_image(photo) as header:
@@ -227,7 +227,7 @@ def _held(cameras: Cameras, index: int) -> Mask | None:
 
 @lru_cache(maxsize=2)
 def _held_at(
-    width: int, height: int, K: tuple[float, ...], distortion: tuple[float, ...], target: tuple[int, int]
+    width: int, height: int, K: tuple[float, ...], distortion: tuple[float, ...], target: Size
 ) -> Mask:
     held = _lookup(width, height, K, distortion)[-1].reshape(height, width, 1)
     found = resized(held.astype(np.float32), target)[..., 0] > _WHOLE
@@ -238,7 +238,7 @@ def _held_at(
 _WHOLE = 0.999  # share of a pixel above which it counts as whole
 
 
-def _open(path: Path, like: tuple[int, int] | None = None) -> Float32:
+def _open(path: Path, like: Size | None = None) -> Float32:
     """Decode a photo as (H, W, 3) sRGB, or as premultiplied (H, W, 4) RGBA; for `like` see `turns`."""
     with opened_image(path) as stored:
         wide, upright = _is_deep(stored), turns(stored, like)
@@ -398,11 +398,11 @@ def _modified(path: Path) -> int | None:
 
 
 @lru_cache(maxsize=1)  # several views of a photo follow each other
-def _opened(path: Path, modified: int | None, like: tuple[int, int]) -> Float32:
+def _opened(path: Path, modified: int | None, like: Size) -> Float32:
     return _open(path, like)
 
 
-def _through(image: Float32, lens: PhotoLens, K: Float, size: tuple[int, int]) -> Float32:
+def _through(image: Float32, lens: PhotoLens, K: Float, size: Size) -> Float32:
     """Sample a photo through its lens for each pixel of a pinhole view: bilinearly at as many points a pixel
     as the photo is finer, which are averaged."""
     height, width = image.shape[:2]
@@ -423,9 +423,7 @@ def _samples(lens: PhotoLens, width: int, K: Float) -> int:
 
 
 @lru_cache(maxsize=6)  # the faces of a cube
-def _lens_lookup(
-    lens: PhotoLens, K: tuple[float, ...], size: tuple[int, int], times: int
-) -> tuple[Float, Mask]:
+def _lens_lookup(lens: PhotoLens, K: tuple[float, ...], size: Size, times: int) -> tuple[Float, Mask]:
     """Return the pixel of a lens for each sample of a pinhole view, and whether its photo holds it."""
     v, u = (np.mgrid[0 : size[1] * times, 0 : size[0] * times] + 0.5) / times
     rays = np.stack([u.ravel(), v.ravel(), np.ones(u.size)], 1) @ np.linalg.inv(np.array(K).reshape(3, 3)).T
@@ -438,7 +436,7 @@ def _fold(k1: float, k2: float, k3: float) -> float:
     return min((root.real for root in roots if abs(root.imag) < 1e-9 and root.real > 0), default=np.inf)
 
 
-def resized(image: Float32, size: tuple[int, int]) -> Float32:
+def resized(image: Float32, size: Size) -> Float32:
     """Resize an (H, W, C) float32 image to (width, height): by area when shrinking, bilinearly when growing.
 
     >>> resized(np.full((4, 8, 3), 0.5, np.float32), (2, 1)).tolist()

@@ -29,6 +29,9 @@ _WORDS = {
 
 Value = TypeVar("Value")
 
+Json = dict[str, Any]
+"""An object."""
+
 Number = Annotated[float, Meta(ge=-_LARGEST_NUMBER, le=_LARGEST_NUMBER)]
 Within1 = Annotated[float, Meta(ge=-1, le=1)]
 Weight = Annotated[float, Meta(ge=0, le=_LARGEST_NUMBER)]
@@ -68,12 +71,12 @@ class Place:
         )
 
 
-def read_json(path: Path) -> dict[str, Any]:
+def read_json(path: Path) -> Json:
     """Return the object in a JSON file."""
-    return checked(read_any_json(path), dict[str, Any], Place(path))
+    return checked(read_any_json(path), Json, Place(path))
 
 
-def read_own(path: Path, format: str, version: int) -> dict[str, Any]:
+def read_own(path: Path, format: str, version: int) -> Json:
     """Return the object in a JSON file of g2ard's, which states this format and version."""
     content = read_json(path)
     if content.get("format") != format:

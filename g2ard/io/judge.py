@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from g2ard.io.sanitize import Raw, logits_of
-from g2ard.io.types import Float, Note, Values
+from g2ard.io.types import Float, Note, Notes, Values
 from g2ard.progress import plural
 from g2ard.scene.splats import SH_C0
 
@@ -64,7 +64,7 @@ _FINE = 0.25  # part of the distance of points by which float32 may round them
 
 
 @np.errstate(over="ignore", invalid="ignore")
-def coarse(positions: Values, apart: float) -> tuple[Note, ...]:
+def coarse(positions: Values, apart: float) -> Notes:
     """Return a note if float32 rounded (n, 3) positions by much of the distance `apart` between them."""
     if not len(positions) or not np.array_equal(positions, positions.astype(np.float32)):
         return ()
@@ -115,7 +115,7 @@ class Reading:
     log_scales: bool
     opaque: float | None
     white: float | None
-    notes: tuple[Note, ...]
+    notes: Notes
 
     def opacity_logits(self, values: Values) -> Values:
         """Return logits; opacities past [0, 1] are clamped."""

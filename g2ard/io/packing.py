@@ -2,12 +2,12 @@
 
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from g2ard.errors import InputError
+from g2ard.io.jsonfile import Json
 from g2ard.io.sanitize import LOG_SCALE_LIMIT
 from g2ard.io.types import Bytes, Float, Values
 from g2ard.scene.splats import Splats
@@ -33,10 +33,10 @@ def writable(path: Path, splats: Splats) -> Splats:
     return splats
 
 
-def own_place(stored: Splats) -> dict[str, Any]:
+def own_place(stored: Splats) -> Json:
     """Return what a file states under "g2ard" of a scene `as_stored`: axes, and the offset in these axes."""
     offset = moved_axes(stored.offset, "RDF", stored.axes)
-    own: dict[str, Any] = {"offset": offset.tolist()} if offset.any() else {}
+    own: Json = {"offset": offset.tolist()} if offset.any() else {}
     return own if stored.axes == "RDF" else {**own, "axes": stored.axes}
 
 

@@ -28,7 +28,7 @@ from g2ard.io.finding import (
 from g2ard.io.jsonfile import Place
 from g2ard.io.paths import check_regular
 from g2ard.io.signs import PHOTOS, foreign
-from g2ard.io.types import Float, Note, ViewSet
+from g2ard.io.types import Float, Note, Notes, Size, ViewSet
 from g2ard.progress import plural
 from g2ard.scene.cameras import LARGEST_IMAGE, USUAL, Cameras, check_image
 from g2ard.scene.lenses import PhotoLens
@@ -52,13 +52,13 @@ class Lens(NamedTuple):
     """Size, pinhole matrix and OpenCV distortion k1 k2 p1 p2 k3 of a camera, or the lens of a photo that
     pinhole views are to be made from, or that this is such a view of (`made`)."""
 
-    size: tuple[int, int]
+    size: Size
     K: Float
     distortion: tuple[float, ...] = (0.0,) * 5
     photo: PhotoLens | None = None
     made: bool = False
 
-    def at(self, size: tuple[int, int]) -> Lens:
+    def at(self, size: Size) -> Lens:
         """Return the lens for resized photos."""
         if size == self.size:
             return self
@@ -70,7 +70,7 @@ class Lens(NamedTuple):
     @classmethod
     def pinhole(
         cls,
-        size: tuple[int, int],
+        size: Size,
         focal: tuple[float, float],
         middle: tuple[float, float] | None = None,
         distortion: tuple[float, ...] = (0.0,) * 5,
@@ -111,7 +111,7 @@ class Listed(NamedTuple):
     path: Path
     frames: Sequence[Frame]
     left_out: Sequence[tuple[str, InputError]] = ()
-    notes: tuple[Note, ...] = ()
+    notes: Notes = ()
 
     def whole(self) -> Sequence[Frame]:
         """Return the frames, or raise the error of the first view that is left out."""
@@ -162,9 +162,7 @@ def _begins(path: Path, starts: tuple[bytes, ...]) -> bool:
     return False
 
 
-def photo_size(
-    path: Path, listed_in: Path | None = None, like: tuple[float, float] | None = None
-) -> tuple[int, int]:
+def photo_size(path: Path, listed_in: Path | None = None, like: tuple[float, float] | None = None) -> Size:
     """Read width and height from a photo's header, upright by EXIF if only that fits the size `like`."""
     try:
         with opened_image(path) as image:
@@ -173,7 +171,7 @@ def photo_size(
         raise error if listed_in is None else error.at(hint=f"it is listed in {listed_in}") from None
 
 
-def turned(size: tuple[int, int]) -> tuple[int, int]:
+def turned(size: Size) -> Size:
     return size[1], size[0]
 
 

@@ -32,7 +32,7 @@ from g2ard.io.packing import (
     unit_quats,
     writable,
 )
-from g2ard.io.types import Bytes, Float, Float32, Values
+from g2ard.io.types import Bytes, Float, Float32, Size, Values
 from g2ard.progress import Progress, silent
 from g2ard.scene.shape import longer_axes
 from g2ard.scene.splats import Splats
@@ -140,7 +140,7 @@ def sog_files(
     return files
 
 
-def _size(path: Path, count: int) -> tuple[int, int]:
+def _size(path: Path, count: int) -> Size:
     """Return width and height, multiples of 4, of an image of `count` pixels."""
     width = math.ceil(math.sqrt(count) / 4) * 4
     height = math.ceil(count / width / 4) * 4

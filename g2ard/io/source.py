@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from g2ard.config.choices import RenderModel
     from g2ard.io.stream import PointStream, SceneStream
     from g2ard.io.tile_store import TileStore
-    from g2ard.io.types import Note
+    from g2ard.io.types import Notes
     from g2ard.scene.splats import Splats
 
 
@@ -102,7 +102,7 @@ class Source:
         return None if store is None else store.system
 
     @property
-    def notes(self) -> tuple[Note, ...]:
+    def notes(self) -> Notes:
         """Notes on the scene's file, known once it has been read."""
         return self.scene.all_notes()
 

@@ -15,7 +15,7 @@ from g2ard.errors import InputError
 from g2ard.io import judge
 from g2ard.io.paths import file_identity
 from g2ard.io.sanitize import BLOCK, Raw, Tally
-from g2ard.io.types import Cloud, Float, Float32, Mask, Note, Points, Values
+from g2ard.io.types import Cloud, Float, Float32, Mask, Note, Notes, Points, Values
 from g2ard.progress import plural
 from g2ard.scene.splats import ARRAYS, Splats
 from g2ard.scene.transform import change_of_axes, common_axes, one_model, restored, stand_as
@@ -56,7 +56,7 @@ class Stream(ABC, Generic[Block]):
         path: Path,
         count: int,
         offset: Float | None,
-        notes: tuple[Note, ...] = (),
+        notes: Notes = (),
         item: str = "Gaussian",
     ) -> None:
         self.path, self.count, self.notes, self.tally = path, count, notes, Tally(item)
@@ -77,11 +77,11 @@ class Stream(ABC, Generic[Block]):
     def blocks(self, rows: int, start: int = 0) -> Iterator[Block]:
         """Yield rows from `start` in blocks of at most `rows`, without those that are not finite."""
 
-    def header_notes(self) -> tuple[Note, ...]:
+    def header_notes(self) -> Notes:
         """Return notes other than on rows, known once `blocks` has finished."""
         return self.notes
 
-    def all_notes(self) -> tuple[Note, ...]:
+    def all_notes(self) -> Notes:
         """Return all notes once `blocks` has finished; raise an `InputError` if no row is finite."""
         return (*self.header_notes(), *self.tally.notes(self.path))
 
@@ -102,7 +102,7 @@ class SceneStream(Stream[Splats]):
         count: int,
         rest: int = 0,
         offset: Float | None = None,
-        notes: tuple[Note, ...] = (),
+        notes: Notes = (),
         render_model: RenderModel = "classic",
     ) -> None:
         super().__init__(path, count, offset, notes)
@@ -167,14 +167,14 @@ class PartsStream(SceneStream):
         sh_degree: int,
         offset: Float,
         identity: list[Any] | None = None,
-        notes: tuple[Note, ...] = (),
+        notes: Notes = (),
         render_model: RenderModel = "classic",
     ) -> None:
         super().__init__(path, sum(counts), (sh_degree + 1) ** 2 - 1, offset, notes, render_model)
         self.counts, self._part, self._identity = counts, part, identity
 
     @classmethod
-    def of(cls, path: Path, splats: Splats, notes: tuple[Note, ...]) -> PartsStream:
+    def of(cls, path: Path, splats: Splats, notes: Notes) -> PartsStream:
         """Return the scene of a file that was read as a whole."""
         stream = cls(path, [len(splats)], lambda _: splats, splats.sh_degree, splats.offset, notes=notes)
         stream.render_model, stream.up, stream.axes = splats.render_model, splats.up, splats.axes
@@ -199,7 +199,7 @@ class PartsStream(SceneStream):
                 self.tally.add(block)
                 yield block
 
-    def all_notes(self) -> tuple[Note, ...]:
+    def all_notes(self) -> Notes:
         return self.notes
 
 
@@ -222,7 +222,7 @@ class PointStream(Stream[RawPoints]):
         sample: MarkedPoints,
         scales: Sequence[float] = (1.0,),
         limits: tuple[float, float] | None = None,
-        notes: tuple[Note, ...] = (),
+        notes: Notes = (),
     ) -> None:
         """Open a cloud, whose centre becomes the offset if it is far from the origin.
 
@@ -273,7 +273,7 @@ class PointStream(Stream[RawPoints]):
         for positions, values, noise in self.raw(rows, start):
             yield positions, values, noise | ~positions.any(axis=1) if self._zeros_are_lost else noise
 
-    def header_notes(self) -> tuple[Note, ...]:
+    def header_notes(self) -> Notes:
         notes, (dark, full) = list(self.notes), self._range
         rows = self.tally.rows - self.tally.dropped - self.tally.noise
         if not rows:
@@ -363,7 +363,7 @@ class Joined(Stream[Block]):
     def identity(self) -> list[Any]:
         return [stream.identity() for stream in self.streams]
 
-    def header_notes(self) -> tuple[Note, ...]:
+    def header_notes(self) -> Notes:
         return tuple(replace(n, text=f"{s.path}: {n.text}") for s in self.streams for n in s.header_notes())
 
 
@@ -421,7 +421,7 @@ class JoinedClouds(Joined[RawPoints], PointStream):
         self.system = next(iter(stated), None)
         self.notes = tuple(_far_apart(streams))
 
-    def header_notes(self) -> tuple[Note, ...]:
+    def header_notes(self) -> Notes:
         return (*self.notes, *super().header_notes())
 
     def raw(self, rows: int, start: int) -> Iterator[MarkedPoints]:

@@ -23,7 +23,7 @@ from g2ard.io.detect import MANIFEST
 from g2ard.io.jsonfile import Number, Place, Vector, Whole, checked, read_own
 from g2ard.io.sanitize import Raw
 from g2ard.io.stream import PartsStream
-from g2ard.io.types import Float, Float32, Note
+from g2ard.io.types import Float, Float32, Notes
 from g2ard.scene.kdtree import KdTree
 from g2ard.scene.splats import Splats
 
@@ -83,7 +83,7 @@ class _Manifest(msgspec.Struct):
     offset: Vector
     margin: Number
     cells: Any
-    notes: tuple[Note, ...]
+    notes: Notes
     key: str
     settings: dict[str, Any]
     render_model: RenderModel = "classic"
@@ -118,7 +118,7 @@ class TileStore:
     offset: Float
     margin: float
     tree: KdTree
-    notes: tuple[Note, ...]
+    notes: Notes
     key: str
     settings: Mapping[str, Any]
     render_model: RenderModel = "classic"

@@ -12,10 +12,10 @@ from msgspec import UNSET, UnsetType
 
 from g2ard.errors import InputError
 from g2ard.io.finding import Finder, is_end
-from g2ard.io.jsonfile import Number, Place, Pose, Vector, Whole, checked, read_json
+from g2ard.io.jsonfile import Json, Number, Place, Pose, Vector, Whole, checked, read_json
 from g2ard.io.paths import beside
 from g2ard.io.photos import Frame, Lens, Listed, fits, inverse, photo_size, rigid
-from g2ard.io.types import Float, Note, ViewFiles
+from g2ard.io.types import Float, Note, Notes, Size, ViewFiles
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.lenses import PhotoLens
 
@@ -119,7 +119,7 @@ def _listed(path: Path, files: Mapping[Path, str | None], among: Path | None) ->
 
 def _frames(
     path: Path, among: Path | None, left_out: list[tuple[str, InputError]], split: str | None
-) -> tuple[list[Frame], tuple[Note, ...]]:
+) -> tuple[list[Frame], Notes]:
     """Read the frames of a transforms.json, and append views with numbers that are not finite to `left_out`.
 
     If it lists the names of its splits, these count (None for an unlisted frame), otherwise `split`. Frames
@@ -174,8 +174,8 @@ def _stated(path: Path, lists: dict[str, list[Any]]) -> dict[str, str]:
     return stated
 
 
-def _frame(place: Place, shared: dict[str, Any], entry: Any, finder: Finder, masks: Finder) -> Frame:
-    content, folder = {**shared, **checked(entry, dict[str, Any], place)}, place.path.parent
+def _frame(place: Place, shared: Json, entry: Any, finder: Finder, masks: Finder) -> Frame:
+    content, folder = {**shared, **checked(entry, Json, place)}, place.path.parent
     if "rot_mat" in content:
         content |= _from_matrix_city(folder, checked(content, _Numbered, place))
     frame = checked(content, _Frame, place)
@@ -197,7 +197,7 @@ def _frame(place: Place, shared: dict[str, Any], entry: Any, finder: Finder, mas
     )
 
 
-def _from_matrix_city(folder: Path, frame: _Numbered) -> dict[str, Any]:
+def _from_matrix_city(folder: Path, frame: _Numbered) -> Json:
     """Convert a frame of MatrixCity's blocks: photos by number, rotations scaled by 0.01.
 
     Positions are in metres; MatrixCity's pose folders (transforms_train.json) use 100 m instead.
@@ -236,7 +236,7 @@ def _intrinsics(place: Place, frame: _Frame, photo: Path) -> Lens:
     return Lens.of(PhotoLens(model, lens.size, (K[0, 0], K[1, 1], K[0, 2], K[1, 2], *k)))
 
 
-def _pinhole(place: Place, frame: _Frame, size: tuple[int, int]) -> Lens:
+def _pinhole(place: Place, frame: _Frame, size: Size) -> Lens:
     (width, height), distortion = size, (frame.k1, frame.k2, frame.p1, frame.p2, frame.k3)
     if (K := _matrix(place, frame)) is not None:
         return Lens((width, height), K, distortion)
@@ -277,7 +277,7 @@ def _focal(place: Place, key: str, angle: float | None, pixels: int) -> float | 
     return 0.5 * pixels / math.tan(0.5 * angle)
 
 
-def _size(place: Place, frame: _Frame, photo: Path) -> tuple[int, int]:
+def _size(place: Place, frame: _Frame, photo: Path) -> Size:
     for width, height in ((frame.w, frame.h), (frame.width, frame.height)):
         if width is not UNSET and height is not UNSET:
             return width, height
@@ -295,7 +295,7 @@ def text_of(path: Path, cameras: Cameras, splits: Sequence[str | None]) -> str:
     """
     lenses = [intrinsics_of(cameras, i) for i in range(len(cameras))]
     shared = lenses[0] if all(lens == lenses[0] for lens in lenses) else {}
-    frames: list[dict[str, Any]] = []
+    frames: list[Json] = []
     for i, viewmat in enumerate(cameras.viewmats):
         photo, mask = (
             (cameras.image_paths[i], cameras.mask_paths[i]) if cameras.lenses[i] is None else (None, None)
@@ -305,20 +305,20 @@ def text_of(path: Path, cameras: Cameras, splits: Sequence[str | None]) -> str:
         if (covered := beside(mask, path)) is not None:
             frame["mask_path"] = covered
         frames.append({**frame, **({} if shared else lenses[i]), "transform_matrix": pose.tolist()})
-    head: dict[str, Any] = {"camera_model": "OPENCV", **shared}
+    head: Json = {"camera_model": "OPENCV", **shared}
     for word in sorted({word for word in splits if word}):
         names = [frame["file_path"] for frame, own in zip(frames, splits, strict=True) if own == word]
         head[f"{word}_filenames"] = names
     return json.dumps(head)[:-1] + f', "frames": {json_rows(frames)}}}\n'
 
 
-def intrinsics_of(cameras: Cameras, i: int) -> dict[str, Any]:
+def intrinsics_of(cameras: Cameras, i: int) -> Json:
     """Return intrinsics as in transforms.json."""
     K = cameras.Ks[i]
-    lens: dict[str, Any] = {"w": int(cameras.widths[i]), "h": int(cameras.heights[i])}
+    lens: Json = {"w": int(cameras.widths[i]), "h": int(cameras.heights[i])}
     lens |= {"fl_x": float(K[0, 0]), "fl_y": float(K[1, 1]), "cx": float(K[0, 2]), "cy": float(K[1, 2])}
     return lens | dict(zip(("k1", "k2", "p1", "p2", "k3"), cameras.distortions[i].tolist(), strict=True))
 
 
-def json_rows(rows: list[dict[str, Any]]) -> str:
+def json_rows(rows: list[Json]) -> str:
     return "[\n" + ",\n".join(map(json.dumps, rows)) + "\n]"

@@ -40,6 +40,11 @@ class Note:
         return self.text
 
 
+Notes = tuple[Note, ...]
+Size = tuple[int, int]
+"""Width and height in pixels."""
+
+
 @dataclass(frozen=True, eq=False)
 class Points:
     """A coloured point cloud of N points.
@@ -71,7 +76,7 @@ class Points:
         return len(self.positions)
 
 
-Noted = tuple[Splats, tuple[Note, ...]]
+Noted = tuple[Splats, Notes]
 """Gaussians of a file, and notes."""
 
 
@@ -85,7 +90,7 @@ class Cloud:
     """
 
     points: Points
-    notes: tuple[Note, ...]
+    notes: Notes
     colored: Mask
     axes: Axes | None = None
 
@@ -121,7 +126,7 @@ class ViewSet:
     """
 
     cameras: Cameras
-    notes: tuple[Note, ...] = ()
+    notes: Notes = ()
     splits: tuple[str | None, ...] = ()
     weights: Float | None = None
 
