@@ -37,7 +37,7 @@ class Stream(PointStream):
     def __init__(self, path: Path) -> None:
         header, self.path = read_header(path), path
         self._named = scene_names(header.properties("vertex"))
-        require(path, list(self._named), _POSITION, "a point cloud")
+        require(list(self._named), _POSITION, "a point cloud")
         (self._vertices,) = read_element(path, header, "vertex")
         rows = spread_rows(self._vertices)
         choices = [names for names in COLOR_NAMES if set(names) <= set(self._named)]

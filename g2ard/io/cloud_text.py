@@ -52,9 +52,9 @@ class Stream(HeldPoints):
     """Points of a table, which is read whole. Without colours they are grey by their intensities."""
 
     def __init__(self, path: Path) -> None:
-        names, table = _pcd(path) if path.suffix.lower() == ".pcd" else _text(path, read_text(path))
+        names, table = _pcd(path) if path.suffix.lower() == ".pcd" else _text(read_text(path))
         if not len(table):
-            raise InputError("has no points", path=path)
+            raise InputError("has no points")
         if "rgb" in names and "red" not in names:
             packed = table[:, names.index("rgb")]
             whole = (packed == np.rint(packed)).all()
@@ -62,7 +62,7 @@ class Stream(HeldPoints):
             names = [*names[: table.shape[1] - 3], "red", "green", "blue", *names[table.shape[1] - 3 :]]
         column = {name: names.index(name) for name in _COLUMNS if name in names}
         if missing := [name for name in "xyz" if name not in column]:
-            raise InputError(f"has no column {missing[0]!r} (found {' '.join(names)})", path=path)
+            raise InputError(f"has no column {missing[0]!r} (found {' '.join(names)})")
         shades: tuple[str, ...] = next((names for names in _SHADES if set(names) <= set(column)), ())
         positions, values = (table[:, [column[name] for name in names]] for names in ("xyz", shades))
         super().__init__(path, positions, values, judge.full_scales(np.dtype(np.float64)))
@@ -76,12 +76,12 @@ def check_points(path: Path) -> None:
         return
     with path.open("rb") as file:
         head = decoded(path, file.read(_HEAD))
-    names, _ = _text(path, re.sub(r"[^\r\n]*$", "", head) or head)
+    names, _ = _text(re.sub(r"[^\r\n]*$", "", head) or head)
     if not {"x", "y", "z"} <= set(names):
-        raise InputError(f"has no columns x, y and z (found {' '.join(names)})", path=path)
+        raise InputError(f"has no columns x, y and z (found {' '.join(names)})")
 
 
-def _text(path: Path, text: str) -> tuple[list[str], Float]:
+def _text(text: str) -> tuple[list[str], Float]:
     """Return the names of the columns and the rows of a text, with or without a heading.
 
     Of a table whose heading names x, y and z, only known columns are read, and their names are the first.
@@ -97,7 +97,7 @@ def _text(path: Path, text: str) -> tuple[list[str], Float]:
             break
     rows = text.split("\n", first)[-1]
     if not any(map(str.isdigit, rows)):
-        raise InputError("has no points", path=path)
+        raise InputError("has no points")
     if any(mark in heading for mark in ",;\t"):
         rows = re.sub(r"(?<=([,;\t]))(?=\1|\n)", "nan", rows)  # empty fields
     rows = rows.replace(f"\n{heading}\n", "\n") if heading else rows
@@ -109,11 +109,11 @@ def _text(path: Path, text: str) -> tuple[list[str], Float]:
         )
     except ValueError as error:
         text = str(error).partition(";")[0]
-        raise InputError(f"is not a table of numbers: {text}", path=path) from error
+        raise InputError(f"is not a table of numbers: {text}") from error
     if known is not None:
         names = [names[i] for i in known] + [name for i, name in enumerate(names) if i not in known]
     elif table.size:
-        names = _unnamed(path, table)
+        names = _unnamed(table)
     return names, table
 
 
@@ -126,13 +126,13 @@ def _names(heading: str) -> list[str]:
     return [usual.get(word, word) for word in words]
 
 
-def _unnamed(path: Path, table: Float) -> list[str]:
+def _unnamed(table: Float) -> list[str]:
     """Return the names of columns without a heading, by their number and values."""
     count = table.shape[1]
     whole = [bool((values == np.rint(values)).all()) for values in table.T]
     grid = whole[:5] == [True, True, False, False, False] and table[:, :2].min() >= 0
     if grid and (count > 6 or whole[5:] == [True]):
-        return ["row", "column", *_unnamed(path, table[:, 2:])]  # of a scan's grid, as FARO writes them
+        return ["row", "column", *_unnamed(table[:, 2:])]  # of a scan's grid, as FARO writes them
     names = ["x", "y", "z", *(["intensity"] if count == 4 else [f"column_{k + 1}" for k in range(3, count)])]
     found, alike = list[tuple[bool, bool, int]](), dict[int, float]()
     for start in _TRIPLES.get(count, ()):
@@ -148,7 +148,7 @@ def _unnamed(path: Path, table: Float) -> list[str]:
         names[start : start + 3] = ["red", "green", "blue"]
     elif count < 3 or count > 4:
         text = f"has {count} columns without a heading of x, y and z, none of them colours up to 1 or 255"
-        raise InputError(text, path=path, hint="add a heading, such as: x y z red green blue")
+        raise InputError(text, hint="add a heading, such as: x y z red green blue")
     return names
 
 
@@ -157,7 +157,7 @@ def _pcd(path: Path) -> tuple[list[str], Float]:
     data = path.read_bytes()
     found = re.search(rb"^DATA[ \t]+(\w+)[ \t]*\r?\n", data, re.MULTILINE)
     if found is None:
-        raise damaged("has no line DATA", path=path)
+        raise damaged("has no line DATA")
     how, body = found[1].decode().lower(), data[found.end() :]
     words = [line.split() for line in data[: found.start()].decode("latin-1").splitlines()]
     head = {line[0]: line[1:] for line in words if line}
@@ -177,11 +177,11 @@ def _pcd(path: Path) -> tuple[list[str], Float]:
             table = np.frombuffer(body, rows, count)
         else:
             hint = "`pcl_convert_pcd_ascii_binary IN.pcd OUT.pcd 1` unpacks it, with its colours (rgb)"
-            raise InputError(f"has the unsupported kind of data {how!r}", path=path, hint=hint)
+            raise InputError(f"has the unsupported kind of data {how!r}", hint=hint)
     except InputError:
         raise
     except (KeyError, ValueError, IndexError, TypeError) as error:
-        raise damaged(f"cannot be read as .pcd ({error})", path=path) from error
+        raise damaged(f"cannot be read as .pcd ({error})") from error
     names, columns = list[str](), list[Float]()
     for field, name in zip(fields, rows.names or (), strict=False):
         own = table[name].reshape(len(table), -1)

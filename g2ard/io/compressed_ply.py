@@ -53,28 +53,26 @@ class Stream(RawStream):
 
     def __init__(self, path: Path) -> None:
         header = plyfiles.read_header(path)
-        plyfiles.require(path, header.properties("vertex"), _PACKED, "a compressed scene")
+        plyfiles.require(header.properties("vertex"), _PACKED, "a compressed scene")
         chunk_properties = header.properties("chunk")
         bounds = _BOUNDS if "min_r" in chunk_properties else _BOUNDS[:12]  # older files: colours over [0, 1]
-        plyfiles.require(path, chunk_properties, bounds, "a compressed scene", "chunk")
+        plyfiles.require(chunk_properties, bounds, "a compressed scene", "chunk")
         rest = [p for p in header.properties("sh") if re.fullmatch(r"f_rest_\d+", p)]
         if len(rest) not in (0, 9, 24, 45) or set(rest) != {f"f_rest_{k}" for k in range(len(rest))}:
-            raise InputError(f"element 'sh' has {len(rest)} coefficients; expected 9, 24 or 45", path=path)
+            raise InputError(f"element 'sh' has {len(rest)} coefficients; expected 9, 24 or 45")
 
         names = ("vertex", "chunk", "sh") if rest else ("vertex", "chunk")
         vertex, chunk, *sh = plyfiles.read_element(path, header, *names)
         if len(chunk) * _CHUNK_ROWS < len(vertex) or (sh and len(sh[0]) != len(vertex)):
-            raise InputError(
-                f"{len(chunk)} chunks and {plural(len(vertex), 'Gaussian')} do not fit", path=path
-            )
+            raise InputError(f"{len(chunk)} chunks and {plural(len(vertex), 'Gaussian')} do not fit")
         for name in _PACKED:
             if vertex.dtype[name] != np.uint32:
-                raise InputError(f"has type {vertex.dtype[name]}, expected uint", path=path, property=name)
-        offset, mode = plyfiles.offset_of(path, header), plyfiles.render_model_of(header.comments)
+                raise InputError(f"has type {vertex.dtype[name]}, expected uint", property=name)
+        offset, mode = plyfiles.offset_of(header), plyfiles.render_model_of(header.comments)
         model: RenderModel = "antialiased" if mode == "antialiased" else "classic"
         super().__init__(path, len(vertex), len(rest) // 3, offset, render_model=model)
         self.up = plyfiles.up_of(header.comments)
-        self.restore(plyfiles.axes_of(path, header))
+        self.restore(plyfiles.axes_of(header))
         self._vertex, self._sh, self._rest = vertex, sh[0] if sh else None, len(rest) // 3
         self._bounds = np.tile([[0.0] * 3, [1.0] * 3], (len(chunk), 3, 1, 1))
         stored = structured_to_unstructured(np.asarray(chunk)[bounds]).reshape(len(chunk), -1, 2, 3)

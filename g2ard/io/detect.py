@@ -14,7 +14,7 @@ from typing import Any, Literal
 from g2ard.config.choices import BLACK, Colour
 from g2ard.errors import InputError
 from g2ard.io.finding import usable
-from g2ard.io.paths import check_regular
+from g2ard.io.paths import about, check_regular
 from g2ard.io.signs import MESH, Sign, foreign, sign_of
 
 Kind = Literal["splats", "points", "views"]
@@ -144,7 +144,8 @@ def reader(path: Path, name: str, expected: Kind) -> Any:
         name = "points3d"
     elif found != expected and (expected, name) != ("views", "e57"):
         if name in ("glb", "usd"):  # its error says what it holds instead of Gaussians
-            import_module(f"g2ard.io.{name}").read(path)
+            with about(path):
+                import_module(f"g2ard.io.{name}").read(path)
         if name == "cloud_ply" and plyfiles.is_mesh(plyfiles.read_header(path)):
             raise InputError("is a mesh", path=path, hint=MESH)
         what = _NAMES[found] if found != "views" else name

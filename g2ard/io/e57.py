@@ -47,7 +47,7 @@ class Stream(JoinedClouds):
         with _opened(path) as file:
             headers = [file.get_header(number) for number in range(file.scan_count)]
             counts = [header.point_count for header in headers]
-            check_unpacked(path, path.stat().st_size, 24 * sum(counts))
+            check_unpacked(path.stat().st_size, 24 * sum(counts))
             self._photos = sum(node.isDefined("pose") for node in _images(file))
             scans = [_Scan(path, header, number) for number, header in enumerate(headers) if counts[number]]
         if not scans:

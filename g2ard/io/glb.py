@@ -305,17 +305,17 @@ def _chunks(path: Path) -> tuple[Any, bytes]:
     if path.suffix.lower() == ".gltf":
         return _with_buffer(path, parse_json(path, decoded(path, data)))
     if len(data) < 20 or struct.unpack_from("<II", data) != (_MAGIC, 2):
-        raise InputError(f"not a .glb of glTF 2.0 (begins with {data[:4]!r})", path=path)
+        raise InputError(f"not a .glb of glTF 2.0 (begins with {data[:4]!r})")
     found: dict[int, bytes] = {}
     at = 12
     while at + 8 <= len(data):
         size, kind = struct.unpack_from("<II", data, at)
         if at + 8 + size > len(data):
-            raise damaged(f"truncated: a chunk of {size:,} bytes is cut off", path=path)
+            raise damaged(f"truncated: a chunk of {size:,} bytes is cut off")
         found.setdefault(kind, data[at + 8 : at + 8 + size])
         at += 8 + size
     if _JSON not in found:
-        raise InputError("holds no JSON chunk", path=path)
+        raise InputError("holds no JSON chunk")
     return parse_json(path, decoded(path, found[_JSON])), found.get(_BIN, b"")
 
 
@@ -324,13 +324,13 @@ def _with_buffer(path: Path, document: Any) -> tuple[Any, bytes]:
     buffers = document.get("buffers") if isinstance(document, dict) else None
     uri = buffers[0].get("uri") if isinstance(buffers, list) and len(buffers) == 1 else None
     if not isinstance(buffers, list) or not isinstance(uri, str):
-        raise InputError("expected one buffer with a uri", path=path, hint="export it as .glb")
+        raise InputError("expected one buffer with a uri", hint="export it as .glb")
     document = {**document, "buffers": [{**buffers[0], "uri": None}]}
     if uri.startswith("data:"):
         try:
             return document, base64.b64decode(uri.partition(",")[2], validate=True)
         except ValueError as error:
-            raise damaged(f"broken base64 in a buffer ({error})", path=path) from error
+            raise damaged(f"broken base64 in a buffer ({error})") from error
     file = path.parent / unquote(uri)
     check_regular(file)
     return document, file.read_bytes()
@@ -339,12 +339,12 @@ def _with_buffer(path: Path, document: Any) -> tuple[Any, bytes]:
 def _scene(path: Path, document: _Document, binary: bytes) -> Noted:
     """Read all splat primitives, each as often as nodes show it."""
     others = sum(not _has_splats(primitive) for mesh in document.meshes for primitive in mesh.primitives)
-    found = placed(path, _shown(path, document, binary))
+    found = placed(_shown(path, document, binary))
     if found is None:
         modes = {primitive.mode for mesh in document.meshes for primitive in mesh.primitives}
         held = "points" if modes == {0} else "a mesh" if modes else "nothing"
         hint = SCAN if modes == {0} else MESH if modes else None
-        raise InputError(f"holds {held}: no primitive has {EXTENSION}", path=path, hint=hint)
+        raise InputError(f"holds {held}: no primitive has {EXTENSION}", hint=hint)
     text = f"{plural(others, 'other primitive')} ignored"
     found = restored(found[0], _axes(document.nodes)), found[1]
     return (found[0], (Note("ignored_meshes", others, text), *found[1])) if others else found
@@ -376,7 +376,7 @@ def _shown(path: Path, document: _Document, binary: bytes) -> Iterator[tuple[Not
             yield from ((scene, placement) for placement in placements)
 
 
-def placed(path: Path, parts: Iterable[tuple[Noted, Float]]) -> Noted | None:
+def placed(parts: Iterable[tuple[Noted, Float]]) -> Noted | None:
     """Join parts by their (4, 4) placements, in the axes of a .ply; return None without parts."""
     moved, notes, uneven = list[Splats](), list[Note](), 0
     for (part, own), placement in parts:
@@ -384,7 +384,7 @@ def placed(path: Path, parts: Iterable[tuple[Noted, Float]]) -> Noted | None:
         try:
             splats, exact = deformed(part, placement)
         except InputError as error:
-            raise error.at(path=path, parameter=None, message=f"a node {error.message}") from None
+            raise error.at(parameter=None, message=f"a node {error.message}") from None
         moved.append(splats)
         uneven += not exact
     if uneven:
@@ -402,11 +402,11 @@ def _primitive(within: Place, document: _Document, binary: bytes, primitive: _Pr
     splats = checked(primitive.extensions.get(EXTENSION, {}), _Splatting, place)
     held = {*splats.extensions, *filter(_SPLATS.match, primitive.extensions)}
     if unknown := sorted(held - {EXTENSION, *_SPZ_EXTENSIONS}):
-        raise InputError(f"unsupported extension {unknown[0]!r}", path=path)
+        raise InputError(f"unsupported extension {unknown[0]!r}")
     if splats.quantized_position_scale != 1:
         raise place.to("quantizedPositionScale").error("is unsupported")
     if splats.kernel != "ellipse":
-        raise InputError("unsupported kernel; expected 'ellipse'", path=path)
+        raise InputError("unsupported kernel; expected 'ellipse'")
     notes = [LINEAR_NOTE] if "lin" in str(splats.color_space).lower() else []
     name = next((name for name in _SPZ_EXTENSIONS if name in held), None)
     if name is None:
@@ -449,7 +449,7 @@ def _attributes_of(place: Place, document: _Document, binary: bytes, names: Json
         raw.quats[:] = values(f"{EXTENSION}:ROTATION", 4)[:, [3, 0, 1, 2]] * (1, *_GLTF_TURN)
         for name, k in _harmonics(degree):
             raw.shN[:, k] = values(name, 3) * _SH_FLIPS[k]
-    return cleaned(place.path, raw, notes)
+    return cleaned(raw, notes)
 
 
 def _entry(table: list[_Entry], index: int | None, place: Place) -> _Entry:
@@ -475,17 +475,15 @@ def _accessor(place: Place, document: _Document, binary: bytes, index: int, name
     accessor = _entry(document.accessors, index, place)
     dtype = np.dtype(_DTYPES.get(accessor.component_type, "V1"))
     if dtype.kind == "V" or _TYPES.get(accessor.type) != width or accessor.sparse is not None:
-        raise InputError(f"attribute {name!r} has an unsupported type", path=path)
+        raise InputError(f"attribute {name!r} has an unsupported type")
     view = _view(document, accessor.buffer_view, Place(path).to("accessors", index), f"attribute {name!r}")
     row = width * dtype.itemsize
     step = row if view.byte_stride is None else view.byte_stride
     start = view.byte_offset + accessor.byte_offset
     if step < row:
-        raise InputError(
-            f"attribute {name!r} has a stride of {step} bytes, less than its elements", path=path
-        )
+        raise InputError(f"attribute {name!r} has a stride of {step} bytes, less than its elements")
     if accessor.count and start + step * (accessor.count - 1) + row > len(binary):
-        raise damaged(f"truncated: attribute {name!r} ends past the file", path=path)
+        raise damaged(f"truncated: attribute {name!r} ends past the file")
     rows = np.ndarray((accessor.count, width), dtype, binary, start, (step, dtype.itemsize))
     if not accessor.normalized:
         return rows.astype(np.float32)
@@ -515,7 +513,7 @@ def _placements(path: Path, nodes: list[_Node], mesh: int, seen: set[int]) -> li
         for k, child in enumerate(node.children):
             _entry(nodes, child, Place(path).to("nodes", i, "children", k))
             if parents.setdefault(child, i) != i:
-                raise InputError(f"node {child} has 2 parents", path=path)
+                raise InputError(f"node {child} has 2 parents")
     found = []
     holders = [i for i, node in enumerate(nodes) if node.mesh == mesh]
     for shown in (i for i in holders if i in seen):
@@ -523,13 +521,13 @@ def _placements(path: Path, nodes: list[_Node], mesh: int, seen: set[int]) -> li
         total, above = np.eye(4), set[int]()
         while at is not None:
             if at in above:
-                raise InputError(f"node {at} is its own ancestor", path=path)
+                raise InputError(f"node {at} is its own ancestor")
             above.add(at)
             with np.errstate(over="ignore", invalid="ignore"):
                 total = _local(nodes[at]) @ total
             at = parents.get(at)
         if not np.isfinite(total[:3, 3]).all():
-            raise InputError(f"invalid translation {tuple(total[:3, 3].tolist())}", path=path)
+            raise InputError(f"invalid translation {tuple(total[:3, 3].tolist())}")
         found.append(total * np.outer((*_GLTF_TURN, 1), (*_GLTF_TURN, 1)))
     return found if holders else [np.eye(4)]
 

@@ -34,40 +34,40 @@ def read(path: Path) -> Noted:
     """
     data = path.read_bytes()
     if len(data) < _HEADER:
-        raise damaged("is cut off within its header", path=path)
+        raise damaged("is cut off within its header")
     if data[0] != 0 or data[1] < 1:
-        raise InputError(f"unsupported version {data[0]}.{data[1]}; expected 0.1", path=path)
+        raise InputError(f"unsupported version {data[0]}.{data[1]}; expected 0.1")
     words, floats = np.frombuffer(data, "<u4", 11), np.frombuffer(data, "<f4", 11)
     level, sections = int(words[5] & 0xFFFF), int(words[1])
     if level not in (0, 1, 2):
-        raise InputError(f"unsupported compression level {level}; expected 0, 1 or 2", path=path)
+        raise InputError(f"unsupported compression level {level}; expected 0, 1 or 2")
     limits = tuple(float(given) or usual for given, usual in zip(floats[9:11], _SH_RANGE, strict=True))
     at = _HEADER + sections * _SECTION.itemsize
     if len(data) < at:
-        raise damaged(f"is cut off within the headers of {sections} sections", path=path)
+        raise damaged(f"is cut off within the headers of {sections} sections")
     parts = []
     for i in range(sections):
-        raw, at = _rows(path, data, i, at, _section(path, data, i), level, limits)
+        raw, at = _rows(data, i, at, _section(data, i), level, limits)
         parts.append(raw)
     rest = max((raw.shN.shape[1] for raw in parts), default=0)
     whole, start = Raw.empty(sum(len(raw.means) for raw in parts), rest), 0
     whole.shN[:] = 0
     for raw in parts:
         whole.take(slice(start, start := start + len(raw.means))).fill(vars(raw).values())
-    return cleaned(path, whole)
+    return cleaned(whole)
 
 
-def _section(path: Path, data: bytes, i: int) -> dict[str, Any]:
+def _section(data: bytes, i: int) -> dict[str, Any]:
     values = np.frombuffer(data, _SECTION, 1, _HEADER + i * _SECTION.itemsize)[0].item()
     section = dict(zip(_SECTION.names or (), values, strict=True))
     if section["degree"] not in _SH_COUNTS:
         text = f"has the unsupported SH degree {section['degree']}; expected 0 to 3"
-        raise InputError(text, path=path, index=i, item="section")
+        raise InputError(text, index=i, item="section")
     return section
 
 
 def _rows(
-    path: Path, data: bytes, i: int, at: int, section: dict[str, Any], level: int, limits: tuple[float, ...]
+    data: bytes, i: int, at: int, section: dict[str, Any], level: int, limits: tuple[float, ...]
 ) -> tuple[Raw, int]:
     """Return the rows of section `i`, which begins at byte `at`, and the byte after it."""
     packed = "<f4" if level == 0 else "<u2"
@@ -85,10 +85,10 @@ def _rows(
     begin = at + 4 * section["partial"] + section["bucket_bytes"] * section["buckets"]
     end = begin + row.itemsize * section["capacity"]
     if end > len(data):
-        raise damaged("is cut off", path=path, index=i, item="section")
+        raise damaged("is cut off", index=i, item="section")
     rows = np.frombuffer(data, row, count, begin)
     raw = Raw.empty(count, harmonics // 3)
-    raw.means[:] = rows["mean"] if level == 0 else _centres(path, data, i, at, section, rows["mean"])
+    raw.means[:] = rows["mean"] if level == 0 else _centres(data, i, at, section, rows["mean"])
     raw.set_linear(rows["scale"], rows["rgba"][:, 3] / 255)
     raw.quats[:] = rows["quat"]
     raw.sh0[:, 0] = (rows["rgba"][:, :3] / 255 - 0.5) / SH_C0
@@ -101,15 +101,15 @@ def _rows(
     return raw, end
 
 
-def _centres(path: Path, data: bytes, i: int, at: int, section: dict[str, Any], steps: Values) -> Float:
+def _centres(data: bytes, i: int, at: int, section: dict[str, Any], steps: Values) -> Float:
     """Return positions from 16-bit steps: full buckets first, then partial ones of the listed lengths."""
     full, partial, buckets, size = (section[k] for k in ("full", "partial", "buckets", "bucket_bytes"))
     if size < 12 or full + partial != buckets:
-        raise damaged("has inconsistent buckets", path=path, index=i, item="section")
+        raise damaged("has inconsistent buckets", index=i, item="section")
     lengths = np.frombuffer(data, "<u4", partial, at).astype(np.int64)
     lengths = np.concatenate([np.full(full, section["bucket_size"], np.int64), lengths])
     if lengths.sum() < len(steps):
-        raise damaged("has more rows than its buckets hold", path=path, index=i, item="section")
+        raise damaged("has more rows than its buckets hold", index=i, item="section")
     table = np.frombuffer(data, "u1", buckets * size, at + 4 * partial).reshape(buckets, size)
     centres = np.ascontiguousarray(table[:, :12]).view("<f4").astype(np.float64)
     bucket = np.repeat(np.arange(buckets), np.minimum(lengths, len(steps)))[: len(steps)]

@@ -11,7 +11,7 @@ import numpy as np
 
 from g2ard.errors import InputError, damaged
 from g2ard.io import judge
-from g2ard.io.paths import check_unpacked
+from g2ard.io.paths import about, check_unpacked
 from g2ard.io.stream import MarkedPoints, Names, PointStream, telling
 from g2ard.io.types import Note
 
@@ -68,7 +68,7 @@ class Stream(PointStream):
                 wanted = min(rows, self.count - first)
                 las = reader.read_points(wanted)
                 if len(las) < wanted:
-                    _check_count(self.path, first + len(las), self.count)
+                    _check_count(first + len(las), self.count)
                 yield _points(las, self._color)
 
 
@@ -101,27 +101,28 @@ def _opened(path: Path) -> Iterator[Any]:
     """Open a file with laspy, after checking its header against the file's size."""
     import laspy
 
-    _check_records(path)
-    try:
-        with laspy.open(path) as reader:
-            header = reader.header
-            reader.recovered = _recovered(path, header)
-            for name, values in (("scale", header.scales), ("offset", header.offsets)):
-                if not np.isfinite(values).all() or (name == "scale" and not values.all()):
-                    raise damaged(f"broken header: its {name}s are {values.tolist()}", path=path)
-            if header.are_points_compressed:
-                _check_chunk_table(path, header.offset_to_point_data, header.point_count)
-                _check_chunks(path, header)
-            else:
-                room = max(0, path.stat().st_size - header.offset_to_point_data)
-                _check_count(path, room // header.point_format.size, header.point_count)
-            yield reader
-    except (InputError, GeneratorExit):
-        raise
-    except BaseException as error:  # laspy raises any exception for damaged files, and lazrs may panic
-        if not isinstance(error, Exception) and type(error).__name__ != "PanicException":
+    with about(path):
+        _check_records(path)
+        try:
+            with laspy.open(path) as reader:
+                header = reader.header
+                reader.recovered = _recovered(path, header)
+                for name, values in (("scale", header.scales), ("offset", header.offsets)):
+                    if not np.isfinite(values).all() or (name == "scale" and not values.all()):
+                        raise damaged(f"broken header: its {name}s are {values.tolist()}")
+                if header.are_points_compressed:
+                    _check_chunk_table(path, header.offset_to_point_data, header.point_count)
+                    _check_chunks(path, header)
+                else:
+                    room = max(0, path.stat().st_size - header.offset_to_point_data)
+                    _check_count(room // header.point_format.size, header.point_count)
+                yield reader
+        except (InputError, GeneratorExit):
             raise
-        raise InputError(f"cannot be read as LAS: {str(error) or type(error).__name__}", path=path) from error
+        except BaseException as error:  # laspy raises any exception for damaged files, and lazrs may panic
+            if not isinstance(error, Exception) and type(error).__name__ != "PanicException":
+                raise
+            raise InputError(f"cannot be read as LAS: {str(error) or type(error).__name__}") from error
 
 
 def _number(path: Path, at: int, kind: str) -> Any:
@@ -143,7 +144,7 @@ def _recovered(path: Path, header: Any) -> bool:
     room = max(0, end - header.offset_to_point_data)
     if header.are_points_compressed:
         if not legacy and room > 64:  # bytes of an empty chunk table, and some
-            raise damaged("broken header: it states 0 points, and compressed ones follow", path=path)
+            raise damaged("broken header: it states 0 points, and compressed ones follow")
         header.point_count = legacy
     else:
         header.point_count = room // header.point_format.size
@@ -153,19 +154,19 @@ def _recovered(path: Path, header: Any) -> bool:
 def _check_records(path: Path) -> None:
     """Check the number of variable-length records against the file's size, since laspy tries to read all."""
     if (begin := _number(path, 0, "4s")) != b"LASF":
-        raise InputError(f"cannot be read as LAS (begins with {begin!r})", path=path)
+        raise InputError(f"cannot be read as LAS (begins with {begin!r})")
     points_at, records = _number(path, 96, "<I"), _number(path, 100, "<I")
     extended = _number(path, 243, "<I") if _number(path, 25, "<B") >= 4 else 0
     size = path.stat().st_size
     if points_at > size:
-        raise damaged(f"truncated: points begin at byte {points_at:,} of {size:,}", path=path)
+        raise damaged(f"truncated: points begin at byte {points_at:,} of {size:,}")
     if records * 54 > points_at or extended * 60 > size:
-        raise damaged(f"broken header: {records + extended:,} variable-length records", path=path)
+        raise damaged(f"broken header: {records + extended:,} variable-length records")
 
 
-def _check_count(path: Path, there: int, promised: int) -> None:
+def _check_count(there: int, promised: int) -> None:
     if there < promised:
-        raise damaged(f"truncated: {there:,} of {promised:,} points", path=path)
+        raise damaged(f"truncated: {there:,} of {promised:,} points")
 
 
 def _check_chunk_table(path: Path, points_at: int, promised: int) -> None:
@@ -174,12 +175,12 @@ def _check_chunk_table(path: Path, points_at: int, promised: int) -> None:
     if table == -1:  # streamed file: the offset is at its end
         table = _number(path, size - 8, "<q")
     if not points_at < table <= size - 8:
-        raise damaged("truncated: the chunk table is cut off", path=path)
+        raise damaged("truncated: the chunk table is cut off")
     chunks = _number(path, table + 4, "<I")
     if chunks > max(promised, 1):
-        raise damaged(f"broken chunk table: {chunks:,} chunks for {promised:,} points", path=path)
+        raise damaged(f"broken chunk table: {chunks:,} chunks for {promised:,} points")
     if chunks > table - points_at:
-        raise damaged(f"broken chunk table: {chunks:,} chunks in {table - points_at:,} bytes", path=path)
+        raise damaged(f"broken chunk table: {chunks:,} chunks in {table - points_at:,} bytes")
 
 
 def _check_chunks(path: Path, header: Any) -> None:
@@ -188,22 +189,22 @@ def _check_chunks(path: Path, header: Any) -> None:
 
     records = header.vlrs.get("LasZipVlr")
     if not records:
-        raise damaged("broken header: the LASzip record is missing", path=path)
+        raise damaged("broken header: the LASzip record is missing")
     layout = lazrs.LazVlr(records[0].record_data)
     size, wanted = layout.item_size(), header.point_format.size
     if size != wanted:
-        raise damaged(f"broken header: compressed points of {size} bytes, not {wanted}", path=path)
+        raise damaged(f"broken header: compressed points of {size} bytes, not {wanted}")
     if not layout.uses_variable_size_chunks():
         chunk = layout.chunk_size()
         if not 0 < chunk * size <= max(_LARGEST_CHUNK, header.point_count * size):
-            raise damaged(f"broken header: chunks of {chunk:,} points", path=path)
+            raise damaged(f"broken header: chunks of {chunk:,} points")
     with path.open("rb") as file:
         file.seek(header.offset_to_point_data)
         table = lazrs.read_chunk_table(file, layout)
     room, taken = (sum(column) for column in zip(*table, strict=True)) if table else (0, 0)
     there = path.stat().st_size
     if min((packed for _, packed in table), default=0) < 0 or taken > there - header.offset_to_point_data:
-        raise damaged(f"broken chunk table: chunks of {taken:,} bytes", path=path)
+        raise damaged(f"broken chunk table: chunks of {taken:,} bytes")
     if room < header.point_count:
-        raise damaged(f"truncated: at most {room:,} of {header.point_count:,} points", path=path)
-    check_unpacked(path, there, header.point_count * size)
+        raise damaged(f"truncated: at most {room:,} of {header.point_count:,} points")
+    check_unpacked(there, header.point_count * size)

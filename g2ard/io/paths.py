@@ -7,11 +7,12 @@ import re
 import sys
 import tempfile
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any
 
-from g2ard.errors import InputError
+from g2ard.errors import G2ardError, InputError
 
 _LONGEST_NAME = 200  # longest file name, bytes; systems allow 255, including suffixes and temporary names
 
@@ -40,11 +41,20 @@ def check_regular(path: Path) -> None:
         raise InputError("not a regular file", path=path)
 
 
-def check_unpacked(path: str | Path, packed: int, unpacked: int) -> None:
+def check_unpacked(packed: int, unpacked: int, path: Path | None = None) -> None:
     """Raise an `InputError` for data that unpacks to over 64 MiB and over 100 times its size, in bytes."""
     most = max(_ALWAYS_UNPACKED, _LARGEST_RATIO * packed)
     if unpacked > most:
         raise InputError(f"{packed:,} bytes would unpack to {unpacked:,}; the limit is {most:,}", path=path)
+
+
+@contextmanager
+def about(path: Path) -> Iterator[None]:
+    """Let errors in the block that name no file name this one."""
+    try:
+        yield
+    except G2ardError as error:
+        raise error.at(path=error.path or path) from error.__cause__
 
 
 def read_text(path: Path) -> str:

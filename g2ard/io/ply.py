@@ -59,16 +59,16 @@ class Stream(RawStream):
         round_ones = len(self._scales) == 1 and not any(name in names for name in _QUATS)
         self._quats = [] if round_ones else _QUATS
         needed = [*_MEANS, *(self._rgb or _DC), "opacity", *self._scales, *self._quats]
-        plyfiles.require(path, list(names), needed, "a 3DGS scene")
+        plyfiles.require(list(names), needed, "a 3DGS scene")
         rest = sorted((p for p in names if re.fullmatch(r"f_rest_\d{1,3}", p)), key=lambda p: int(p[7:]))
-        stored, kept = _bands(path, rest)
+        stored, kept = _bands(rest)
         rows = _joined(plyfiles.read_element(path, header, *groups))
         self._names, self._path, self._rows = names, path, rows
         shift = np.zeros(3)
         if rows.dtype[names["x"]].itemsize == 8:
             sample = plyfiles.spread_rows(rows)
             shift = far_middle(np.stack([sample[names[name]] for name in _MEANS], axis=1))
-        offset = plyfiles.offset_of(path, header) + shift
+        offset = plyfiles.offset_of(header) + shift
         moving = [name for name in names if _TIME.fullmatch(name)]
         moving += [name for name in _DEFORMS if (path.absolute().parent / name).exists()]
         notes = [*_frames(header), *_ignored([n for n in names if n not in needed], rest, stored, kept)]
@@ -84,7 +84,7 @@ class Stream(RawStream):
         model: RenderModel = "antialiased" if mode == "antialiased" and not flat else "classic"
         super().__init__(path, len(rows), kept, offset, tuple(notes), model)
         self.up = plyfiles.up_of(header.comments)
-        self.restore(plyfiles.axes_of(path, header))
+        self.restore(plyfiles.axes_of(header))
         self._shift, self._flat = shift, flat
         self._rest, self._stored, self._kept = rest, stored, kept
         self._read, self._white = self._judged()
@@ -189,12 +189,10 @@ def _frames(header: plyfiles.PlyHeader) -> list[Note]:
     return [Note("ignored_frames", len(moving), text)]
 
 
-def _bands(path: Path, rest: list[str]) -> tuple[int, int]:
+def _bands(rest: list[str]) -> tuple[int, int]:
     """Return the numbers of stored and of kept coefficients past band 0 per channel."""
     if [int(p[7:]) for p in rest] != list(range(len(rest))) or len(rest) not in (0, 9, 24, 45, 72):
-        raise InputError(
-            f"expected f_rest_0 to f_rest_n with 0, 9, 24 or 45 of them, got {len(rest)}", path=path
-        )
+        raise InputError(f"expected f_rest_0 to f_rest_n with 0, 9, 24 or 45 of them, got {len(rest)}")
     return len(rest) // 3, min(len(rest) // 3, 15)
 
 

@@ -131,7 +131,7 @@ def groups_of(header: PlyHeader) -> list[str]:
     return ["vertex"] if "vertex" in header.counts or not groups else groups
 
 
-def offset_of(path: Path, header: PlyHeader) -> Float:
+def offset_of(header: PlyHeader) -> Float:
     """Return the (3,) offset of a comment `g2ard offset X Y Z`, turned to the file's axes; zeros without one.
 
     The comment is in the axes of a comment `g2ard axes`, so it holds coordinates of the map.
@@ -143,18 +143,18 @@ def offset_of(path: Path, header: PlyHeader) -> Float:
             except ValueError:
                 offset = np.full(3, np.nan)
             if not np.isfinite(offset).all():
-                raise damaged(f"broken comment {comment!r}", path=path)
-            return moved_axes(offset, axes_of(path, header), "RDF")
+                raise damaged(f"broken comment {comment!r}")
+            return moved_axes(offset, axes_of(header), "RDF")
     return np.zeros(3)
 
 
-def axes_of(path: Path, header: PlyHeader) -> Axes:
+def axes_of(header: PlyHeader) -> Axes:
     """Return the axes of a comment `g2ard axes NAME`, to which a scene is turned; "RDF" without one."""
     for comment in header.comments:
         if comment.startswith("g2ard axes "):
             found = next((name for name in AXES if comment == f"g2ard axes {name}"), None)
             if found is None:
-                raise damaged(f"broken comment {comment!r}", path=path)
+                raise damaged(f"broken comment {comment!r}")
             return found
     return "RDF"
 
@@ -225,7 +225,7 @@ def read_element(path: Path, header: PlyHeader, *names: str, plain: bool = False
     size = path.stat().st_size
     for name, count in header.counts.items():  # before allocating memory: a row has at least a byte
         if count > size:
-            raise damaged(f"truncated: {count:,} rows of {name!r} in {size:,} bytes", path=path)
+            raise damaged(f"truncated: {count:,} rows of {name!r} in {size:,} bytes")
     triangles = {
         element.name: {p.name: 3 for p in element.properties if isinstance(p, PlyListProperty)}
         for element in header.elements
@@ -243,13 +243,12 @@ def read_element(path: Path, header: PlyHeader, *names: str, plain: bool = False
         name = error.element.name
         raise damaged(
             f"of {header.counts.get(name, 0)} cannot be read ({error.message})",
-            path=path,
             property=error.prop and error.prop.name,
             index=error.row,
             item=f"{name} row",
         ) from error
     except (PlyParseError, ValueError, OSError, OverflowError, MemoryError) as error:
-        raise InputError(f"cannot be read as a PLY: {error}", path=path) from error
+        raise InputError(f"cannot be read as a PLY: {error}") from error
     last = ply.elements[-1].data
     if isinstance(last, np.memmap):
         _check_rest(path, last.offset + last.nbytes)
@@ -330,9 +329,9 @@ def spread_rows(rows: Values, count: int = 100_000) -> Values:
     return np.frombuffer(b"".join(parts), rows.dtype)
 
 
-def require(path: Path, present: list[str], wanted: list[str], what: str, element: str = "vertex") -> None:
+def require(present: list[str], wanted: list[str], what: str, element: str = "vertex") -> None:
     """Raise an `InputError` that lists the `wanted` properties that are not `present`."""
     missing = [name for name in wanted if name not in present]
     if missing:
         words = ", ".join(map(repr, missing))
-        raise InputError(f"{what} needs the {element} property {words}", path=path)
+        raise InputError(f"{what} needs the {element} property {words}")

@@ -69,9 +69,7 @@ class Raw:
         return Splats(means, quats, scales, logits, sh0, shN, offset, render_model, axis)
 
 
-def cleaned(
-    path: Path, raw: Raw, notes: list[Note] | None = None, render_model: RenderModel = "classic"
-) -> Noted:
+def cleaned(raw: Raw, notes: list[Note] | None = None, render_model: RenderModel = "classic") -> Noted:
     """Check, clamp and activate a scene, whose arrays become those of the result.
 
     Rows with NaN or meaningless infinities are dropped. Logits (|x| > 16) and log-scales (|x| > 43) are
@@ -80,7 +78,7 @@ def cleaned(
     """
     tally = Tally()
     keep = tally.clean(raw)
-    notes = [*(notes or ()), *tally.notes(path)]
+    notes = [*(notes or ()), *tally.notes()]
     splats = raw.activated(render_model, np.zeros(3))
     return splats.take(keep) if tally.dropped else splats, tuple(notes)
 
@@ -154,7 +152,7 @@ class Tally:
         self.rows += len(scene)
         self.brightest = float(np.max(scene.logit_opacities, initial=self.brightest))
 
-    def notes(self, path: Path) -> list[Note]:
+    def notes(self, path: Path | None = None) -> list[Note]:
         """Return notes on all rows; raise an `InputError` if none remains."""
         points, left = self.item == "point", self.rows - self.dropped
         if not self.rows:

@@ -105,7 +105,7 @@ class _Chunk:
         try:
             if isinstance(file, zipfile.Path):
                 info = file.root.getinfo(file.at)
-                check_unpacked(path, info.compress_size, info.file_size)
+                check_unpacked(info.compress_size, info.file_size, path)
             else:
                 check_regular(file)
             return file.read_bytes()

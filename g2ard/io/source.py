@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from g2ard.errors import InputError
 from g2ard.io.detect import KINDS, Kind, file_format, reader, run_scene
+from g2ard.io.paths import about
 from g2ard.io.signs import explained
 from g2ard.system.cached import cached_property
 
@@ -128,9 +129,10 @@ class Source:
         module = reader(self.file, self.format, expected)
         if self.others:
             return joined([Source(self.path, self.render_model), *self.others])
-        if hasattr(module, "Stream"):
-            return module.Stream(self.file)
-        return PartsStream.of(self.file, *module.read(self.file))
+        with about(self.file):
+            if hasattr(module, "Stream"):
+                return module.Stream(self.file)
+            return PartsStream.of(self.file, *module.read(self.file))
 
 
 _UNCOLORED = (

@@ -24,7 +24,7 @@ from g2ard.io import packing
 from g2ard.io.atomic import atomic_output
 from g2ard.io.jsonfile import Place as JsonPlace
 from g2ard.io.jsonfile import Vector, checked, parse_json
-from g2ard.io.paths import check_unpacked
+from g2ard.io.paths import about, check_unpacked
 from g2ard.io.sanitize import Raw, cleaned, logits_of
 from g2ard.io.types import Bytes, Float, Note, Noted, Values
 from g2ard.progress import Progress, plural, silent
@@ -72,18 +72,19 @@ def names_axes(path: Path) -> bool:
         return True
     if len(data) < _HEADER_4 or data[:4] != _MAGIC or data[4] != 4 or not data[14] & _HAS_EXTENSIONS:
         return False
-    return _extensions(path, data)[0] != "RUB"
+    with about(path):
+        return _extensions(data)[0] != "RUB"
 
 
 def decoded(path: Path, data: bytes) -> Noted:
     """Read the bytes of an .spz like `read`; `path` names their file in messages."""
     own = _comment(data)
     if data[:2] == b"\x1f\x8b":
-        data = _gunzip(path, data)
-    sizes = _sizes(path, data)
+        data = _gunzip(data)
+    sizes = _sizes(data)
     version, count, degree, fraction_bits, flags, stream_count = struct.unpack_from("<IIBBBB", data, 4)
     stored = _COEFFICIENTS[degree]
-    streams = _zstd_streams(path, data, stream_count, sizes) if version == 4 else _slices(path, data, sizes)
+    streams = _zstd_streams(data, stream_count, sizes) if version == 4 else _slices(data, sizes)
     positions, alphas, colors, scales, rotations, sh = (np.frombuffer(s, np.uint8) for s in streams)
 
     kept = min(stored, 15)
@@ -100,10 +101,10 @@ def decoded(path: Path, data: bytes) -> Noted:
         notes.append(Note("ignored_bands", 1, "spherical harmonics past degree 3 ignored"))
     axes: Axes = "RUB"
     if flags & _HAS_EXTENSIONS:
-        axes, own, ignored = _extensions(path, data) if version == 4 else (axes, own, 1)
+        axes, own, ignored = _extensions(data) if version == 4 else (axes, own, 1)
         if ignored:
             notes.append(Note("ignored_extensions", ignored, "SPZ extensions ignored"))
-    scene, told = cleaned(path, raw, notes, "antialiased" if flags & _ANTIALIASED else "classic")
+    scene, told = cleaned(raw, notes, "antialiased" if flags & _ANTIALIASED else "classic")
     if axes != "RUB":
         matrix = change_of_axes(axes, "RDF") @ change_of_axes("RDF", "RUB")  # so far taken for RUB
         scene = with_axes(scene, matrix)
@@ -138,18 +139,18 @@ def _comment(data: bytes) -> bytes:
     return data[10 : data.find(b"\0", 10)] if commented else b""
 
 
-def _extensions(path: Path, data: bytes) -> tuple[Axes, bytes, int]:
+def _extensions(data: bytes) -> tuple[Axes, bytes, int]:
     """Return the axes that the records of version 4 name, g2ard's own record, and the number of others."""
     axes, own, others, at = _ADOBE_AXES[3], b"", 0, _HEADER_4
     (end,) = struct.unpack_from("<I", data, 16)
     while at + 8 <= min(end, len(data)):
         kind, size = struct.unpack_from("<II", data, at)
         if at + 8 + size > min(end, len(data)):
-            raise damaged("truncated: an extension is cut off", path=path)
+            raise damaged("truncated: an extension is cut off")
         if kind == _COORDINATE_SYSTEM and size == 4:
             (number,) = struct.unpack_from("<I", data, at + 8)
             if number > len(_ADOBE_AXES):
-                raise InputError(f"unknown coordinate system {number}; expected 0 to 16", path=path)
+                raise InputError(f"unknown coordinate system {number}; expected 0 to 16")
             axes = _ADOBE_AXES[number - 1] if number else axes
         elif kind == _OWN_PLACE:
             own = data[at + 8 : at + 8 + size]
@@ -159,84 +160,82 @@ def _extensions(path: Path, data: bytes) -> tuple[Axes, bytes, int]:
     return axes, own, others
 
 
-def _gunzip(path: Path, data: bytes) -> bytes:
+def _gunzip(data: bytes) -> bytes:
     """Unpack the header and as many bytes as it announces."""
     stream = zlib.decompressobj(16 + zlib.MAX_WBITS)
     try:
         head = stream.decompress(data, _HEADER)
-        promised = sum(_sizes(path, head))
-        check_unpacked(path, len(data), promised)
+        promised = sum(_sizes(head))
+        check_unpacked(len(data), promised)
         body = stream.decompress(stream.unconsumed_tail, promised) if promised else b""
     except zlib.error as error:
-        raise damaged(f"truncated or broken gzip stream ({error})", path=path) from error
+        raise damaged(f"truncated or broken gzip stream ({error})") from error
     return head + body
 
 
-def _sizes(path: Path, head: bytes) -> list[int]:
+def _sizes(head: bytes) -> list[int]:
     """Return the bytes of the unpacked positions, alphas, colours, scales, rotations and harmonics."""
     if head[:4] != _MAGIC:
-        raise InputError(f"not an SPZ file (begins with {head[:4]!r})", path=path)
+        raise InputError(f"not an SPZ file (begins with {head[:4]!r})")
     if len(head) < _HEADER:
-        raise damaged(f"truncated: {len(head)} of {_HEADER} bytes of the header", path=path)
+        raise damaged(f"truncated: {len(head)} of {_HEADER} bytes of the header")
     version, count, degree, fraction_bits = struct.unpack_from("<IIBB", head, 4)
     if version not in (2, 3, 4):
-        raise InputError(f"unsupported SPZ version {version}; expected 2, 3 or 4", path=path)
+        raise InputError(f"unsupported SPZ version {version}; expected 2, 3 or 4")
     if degree >= len(_COEFFICIENTS):
-        raise InputError(f"unsupported SH degree {degree}; expected 0 to 4", path=path)
+        raise InputError(f"unsupported SH degree {degree}; expected 0 to 4")
     if fraction_bits > _POSITION_BITS:
-        raise InputError(
-            f"is {fraction_bits}, expected at most {_POSITION_BITS}", path=path, property="fractionalBits"
-        )
+        raise InputError(f"is {fraction_bits}, expected at most {_POSITION_BITS}", property="fractionalBits")
     rotation = 3 if version == 2 else 4
     return [9 * count, count, 3 * count, 3 * count, rotation * count, 3 * _COEFFICIENTS[degree] * count]
 
 
-def _slices(path: Path, data: bytes, sizes: list[int]) -> list[bytes]:
+def _slices(data: bytes, sizes: list[int]) -> list[bytes]:
     ends = _HEADER + np.cumsum(sizes)
     if len(data) < ends[-1]:
-        raise damaged(f"truncated: {len(data):,} of {ends[-1]:,} bytes", path=path)
+        raise damaged(f"truncated: {len(data):,} of {ends[-1]:,} bytes")
     return [data[end - size : end] for end, size in zip(ends, sizes, strict=True)]
 
 
-def _zstd_streams(path: Path, data: bytes, stream_count: int, sizes: list[int]) -> list[bytes]:
+def _zstd_streams(data: bytes, stream_count: int, sizes: list[int]) -> list[bytes]:
     """Unpack the streams of version 4: a table of (packed, unpacked) sizes, then a frame per stream."""
-    check_unpacked(path, len(data), sum(sizes))
+    check_unpacked(len(data), sum(sizes))
     try:
         (table,) = struct.unpack_from("<I", data, 16)
         entries = [struct.unpack_from("<QQ", data, table + 16 * i) for i in range(stream_count)]
     except struct.error as error:
-        raise damaged("truncated: the table of streams is cut off", path=path) from error
+        raise damaged("truncated: the table of streams is cut off") from error
     streams, start = [], table + 16 * stream_count
     for i, size in enumerate(sizes):
         packed, unpacked = entries[i] if i < stream_count else (0, 0)
         if start + packed > len(data):
-            raise damaged(f"truncated in stream {i}", path=path)
-        stream = _unpacked(path, data[start : start + packed], size) if size == unpacked > 0 else b""
+            raise damaged(f"truncated in stream {i}")
+        stream = _unpacked(data[start : start + packed], size) if size == unpacked > 0 else b""
         if unpacked != size or len(stream) != size:
-            raise damaged(f"stream {i} does not hold {size:,} bytes", path=path)
+            raise damaged(f"stream {i} does not hold {size:,} bytes")
         streams.append(stream)
         start += packed
     return streams
 
 
-def _zstandard(path: Path) -> Any:
+def _zstandard() -> Any:
     try:
         if sys.version_info >= (3, 14):
             from compression import zstd
         else:
             from backports import zstd
     except ImportError as error:
-        raise missing("SPZ version 4", "backports.zstd", path=path) from error
+        raise missing("SPZ version 4", "backports.zstd") from error
     return zstd
 
 
-def _unpacked(path: Path, frame: bytes, size: int) -> bytes:
+def _unpacked(frame: bytes, size: int) -> bytes:
     """Unpack a frame of Zstandard, at most one byte past its expected size."""
-    zstd = _zstandard(path)
+    zstd = _zstandard()
     try:
         return bytes(zstd.ZstdDecompressor().decompress(frame, max_length=size + 1))
     except zstd.ZstdError as error:
-        raise damaged(f"broken Zstandard stream ({error})", path=path) from error
+        raise damaged(f"broken Zstandard stream ({error})") from error
 
 
 def _fixed24(triples: Bytes) -> NDArray[np.int32]:
@@ -338,7 +337,8 @@ def encoded(
     head = _MAGIC + struct.pack("<IIBBB", spz_version, len(splats), splats.sh_degree, bits, flags)
     if spz_version < 4:
         return _gzipped(head + b"\0" + b"".join(streams), progress, comment)
-    zstd = _zstandard(path)
+    with about(path):
+        zstd = _zstandard()
     packed = []
     for number, stream in enumerate(streams):
         progress("pack", number, len(streams))

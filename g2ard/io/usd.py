@@ -144,28 +144,28 @@ def read(path: Path) -> Noted:
     try:
         stage = pxr.Usd.Stage.Open(str(path))
     except pxr.Tf.ErrorException as error:
-        raise _not_a_stage(path, error) from error
+        raise _not_a_stage(error) from error
     held = list(stage.Traverse(pxr.Usd.TraverseInstanceProxies(pxr.Usd.PrimDefaultPredicate)))
     fields = [prim for prim in held if _is_field(prim)]
     shown = [prim for prim in fields if _visible(pxr, prim)]
     hidden = len(fields) - len(shown)
     ignored = Note("invisible_prims", hidden, f"{plural(hidden, 'invisible prim')} ignored")
-    parts = ((_read_prim(path, pxr, prim), _to_ply(pxr, stage, prim)) for prim in shown)
-    found = placed(path, parts) if shown else None
+    parts = ((_read_prim(pxr, prim), _to_ply(pxr, stage, prim)) for prim in shown)
+    found = placed(parts) if shown else None
     if found is None:
-        raise InputError(_nothing(path, held, len(fields)), path=path)
+        raise InputError(_nothing(path, held, len(fields)))
     axes = stage.GetRootLayer().customLayerData.get(_AXES)
     scene = restored(found[0], axes) if axes in AXES else found[0]
     return scene, (*found[1], ignored) if hidden else found[1]
 
 
-def _not_a_stage(path: Path, error: Exception) -> InputError:
+def _not_a_stage(error: Exception) -> InputError:
     """Return the error for a file that OpenUSD cannot open, with the line if it states one."""
     text = str(error).strip()
     at = re.search(r":(\d+):\d+: |\bon line (\d+)\b", text)
     if at is None:
-        return InputError(f"not an OpenUSD stage ({text.splitlines()[-1].strip()})", path=path)
-    return InputError("is not valid OpenUSD text", path=path, index=int(at[1] or at[2]), item="line")
+        return InputError(f"not an OpenUSD stage ({text.splitlines()[-1].strip()})")
+    return InputError("is not valid OpenUSD text", index=int(at[1] or at[2]), item="line")
 
 
 def _is_field(prim: Any) -> bool:
@@ -201,33 +201,33 @@ def _nothing(path: Path, held: list[Any], fields: int) -> str:
     return f"has no prim of type {_SCHEMA}" + (f", only {', '.join(types[:4])}{todo}" if types else "")
 
 
-def _read_prim(path: Path, pxr: Any, prim: Any) -> Noted:
-    means = _values(path, pxr, prim, "positions", 3, None)
+def _read_prim(pxr: Any, prim: Any) -> Noted:
+    means = _values(pxr, prim, "positions", 3, None)
     count, notes = len(means), []
     degree = _earliest(pxr, prim.GetAttribute(f"{_SH}Degree"))
     coefficients = any(_given(pxr, prim, f"{_SH}Coefficients{half}") is not None for half in ("", "h"))
     degree = int(degree) if degree is not None and coefficients else 0
     if not 0 <= degree <= 3:
-        raise InputError(f"unsupported SH degree {degree}; expected 0 to 3", path=path)
+        raise InputError(f"unsupported SH degree {degree}; expected 0 to 3")
     size = (degree + 1) ** 2
     raw = Raw.empty(count, size - 1)
     raw.means[:] = means * _USD_TURN
-    raw.quats[:] = _values(path, pxr, prim, "orientations", 4, count)[:, [3, 0, 1, 2]] * _QUAT_TURN
-    alphas = _values(path, pxr, prim, "opacities", 1, count)[:, 0]
+    raw.quats[:] = _values(pxr, prim, "orientations", 4, count)[:, [3, 0, 1, 2]] * _QUAT_TURN
+    alphas = _values(pxr, prim, "opacities", 1, count)[:, 0]
     if coefficients:
-        bands = _values(path, pxr, prim, f"{_SH}Coefficients", 3, count * size).reshape(count, size, 3)
+        bands = _values(pxr, prim, f"{_SH}Coefficients", 3, count * size).reshape(count, size, 3)
         base = bands[:, 0]
         raw.shN[:] = bands[:, 1:] * FLIPS[: size - 1, None]
     else:
-        rgb = _values(path, pxr, prim, _COLOR, 3, None)
+        rgb = _values(pxr, prim, _COLOR, 3, None)
         if len(rgb) not in (1, count):
-            raise InputError(f"has {len(rgb):,} values, expected {count:,}", path=path, property=_COLOR)
+            raise InputError(f"has {len(rgb):,} values, expected {count:,}", property=_COLOR)
         base = np.broadcast_to((rgb / judge.white(rgb, (1.0, 255.0)) - 0.5) / SH_C0, (count, 3))
         notes.append(Note("display_color", count, "colours are those of displayColor, taken as sRGB"))
-    notes += judge.fill(raw, _values(path, pxr, prim, "scales", 3, count), alphas, base)
+    notes += judge.fill(raw, _values(pxr, prim, "scales", 3, count), alphas, base)
     if _color_space(pxr, prim).lower().startswith("lin"):
         notes.append(LINEAR_NOTE)
-    return cleaned(path, raw, notes)
+    return cleaned(raw, notes)
 
 
 def _color_space(pxr: Any, prim: Any) -> str:
@@ -253,15 +253,15 @@ def _given(pxr: Any, prim: Any, name: str) -> Any:
     return values if values is not None and len(values) else None
 
 
-def _values(path: Path, pxr: Any, prim: Any, name: str, width: int, count: int | None) -> Float32:
+def _values(pxr: Any, prim: Any, name: str, width: int, count: int | None) -> Float32:
     """Return the (count, width) values of an attribute in float, or in half with an h after its name."""
     for found in (name, f"{name}h"):
         if (values := _given(pxr, prim, found)) is not None:
             rows = np.asarray(values, np.float32).reshape(-1, width)
             if count is not None and len(rows) != count:
-                raise InputError(f"has {len(rows):,} values, expected {count:,}", path=path, property=name)
+                raise InputError(f"has {len(rows):,} values, expected {count:,}", property=name)
             return rows
-    raise InputError(f"attribute {name!r} of {prim.GetPath()} is missing or empty", path=path)
+    raise InputError(f"attribute {name!r} of {prim.GetPath()} is missing or empty")
 
 
 def _to_ply(pxr: Any, stage: Any, prim: Any) -> Float:
