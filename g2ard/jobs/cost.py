@@ -41,7 +41,7 @@ two take 3.3 s on playbot, and 1.2 and 2.7 s of CPU time on guitar and taebak_pa
 
 _TILED = {
     **{"tiles": 1.5, "coarse": 0.5, "light": 0, "visibility": 3, "costs": 0.2},
-    **{"plans": 0.6, "merge": 0.4, "merged visibility": 0.8, "gaps": 1.3},
+    **{"plans": 0.6, "merge": 0.4, "merged visibility": 0.8, "targets": 1.3},
 }
 """Microseconds per Gaussian of stages in tiles, in order: half to two thirds of the CPU time of guitar and
 150,000 Gaussians of playbot in tiles of 30,000 and 50,000. In larger tiles, 1 to 100 million Gaussians take
@@ -216,7 +216,7 @@ def _tiled_stages(plan: TilePlan, views: int, *, gaps: bool) -> list[tuple[str, 
         gaps: whether the opacity lost is measured.
     """
     done = ["tiles", "coarse"] if plan.written else []
-    done += [] if gaps and views else ["gaps"]
+    done += [] if gaps and views else ["targets"]
     done += [] if views else ["light", "visibility", "merged visibility"]
     return [
         (name, _LIGHT * views + micro * 1e-6 * plan.count if name == "light" else micro * 1e-6 * plan.count)

@@ -13,6 +13,7 @@ from g2ard.config.choices import FormatName, RenderModel
 from g2ard.errors import InputError
 from g2ard.io import Source
 from g2ard.io.scene_formats import check_positions, scene_format
+from g2ard.io.stream import PartsStream
 from g2ard.io.types import Note
 from g2ard.jobs.budget import Budget, count_of
 from g2ard.jobs.budget_search import (
@@ -138,9 +139,9 @@ class Reduction:
             say=self.say,
         )
 
-    def warnings(self, small: Splats) -> list[str]:
-        """Return warnings about the views, and about regions of a result; none for a scene in tiles."""
-        if self.plan is not None or len(small) >= self.total:
+    def warnings(self, small: Splats | PartsStream) -> list[str]:
+        """Return warnings about the views, and about regions of a result that is in memory."""
+        if not isinstance(small, Splats) or len(small) >= self.total:
             return []
         from g2ard.jobs.doubts import doubt_of_distances, doubts_of_regions, doubts_of_views  # as above
 

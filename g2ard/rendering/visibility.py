@@ -128,16 +128,27 @@ def visibility_source(cameras: Cameras, *, longest: int = LONGEST, progress: Pro
     return _Sampler(cameras, longest, progress)
 
 
+def usual_and_others(cameras: Cameras) -> tuple[Cameras, Cameras]:
+    """Return the usual views, all if there are none, and those of other kinds that measure visibility."""
+    every = np.arange(len(cameras))
+    usual = np.array(rows_by_kind(cameras.kinds).get(USUAL, every))
+    other = np.setdiff1d(every, usual)
+    return cameras.take(usual), cameras.take(other[evenly_spaced(len(other), _OTHER_VIEWS)])
+
+
+def weight_of_others(usual: int, others: int) -> float:
+    """Return the weight of a view of another kind among some usual views."""
+    return _OTHER_SHARE * usual / others if others else 0.0
+
+
 class _Sampler:
     """Function of `visibility_source`: `rounds` of usual `views`, of which the first `used` are rendered, and
     `others`."""
 
     def __init__(self, cameras: Cameras, longest: int, progress: Progress) -> None:
-        every = np.arange(len(cameras))
-        usual = np.array(rows_by_kind(cameras.kinds).get(USUAL, every))
-        other = np.setdiff1d(every, usual)
-        self.others = cameras.take(other[evenly_spaced(len(other), _OTHER_VIEWS)]).resized(longest)
-        full = cameras.take(usual[evenly_spaced(len(usual), MOST_VIEWS)])
+        usual, others = usual_and_others(cameras)
+        self.others = others.resized(longest)
+        full = usual.take(evenly_spaced(len(usual), MOST_VIEWS))
         self.views = full.resized(longest)
         self.shrunk = np.float32((self.views.widths / full.widths).mean())
         apart = max(1, math.ceil(len(self.views) / ROUND))
@@ -162,7 +173,7 @@ class _Sampler:
             rendered = sum(map(len, self.rounds[: self.used]))
             sums = _core.VisibilityAccumulator(core)
             self._add(sums, self.others.recentred(scene.offset), range(len(self.others)))
-            weight += np.float32(_OTHER_SHARE * rendered / len(self.others)) * sums.by_row()[0]
+            weight += np.float32(weight_of_others(rendered, len(self.others))) * sums.by_row()[0]
         return SampledVisibility(weight, pixel_size * self.shrunk)
 
     def _add_until_converged(self, sums: _core.VisibilityAccumulator, cameras: Cameras, rows: int) -> int:

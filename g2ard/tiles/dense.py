@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,7 @@ from g2ard.rendering.boxes import front_to_back
 from g2ard.rendering.recolour import seen_by, shifted
 from g2ard.rendering.renderer import RasterSettings, Renderer, settings_for
 from g2ard.rendering.targets import Cached, Targets, unrounded
-from g2ard.rendering.visibility import LONGEST
+from g2ard.rendering.visibility import LONGEST, usual_and_others
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats
 from g2ard.scene.transform import stand_as
@@ -111,15 +111,23 @@ class InTiles:
         """Merge the scene, see `Dense`; finished steps are in the folder of the workers.
 
         `protected` and `final_budget` serve the method `paper`, which needs the whole scene in memory.
+        Colours are fitted, and gaps measured, only if the result is in memory.
         """
-        done = simplify_tiles(self._run, count, views, gaps=gaps)
-        splats: Splats | PartsStream = done.splats
-        if views is not None and self.total >= MANY * count and count <= self.most_rows:
-            splats = self._recoloured(done.splats.whole(), views, progress)
-        return MergedTiles(splats, done.report)
+        done = simplify_tiles(self._run, count, views)
+        if count > self.most_rows:
+            return MergedTiles(done.splats, done.report)
+        small, report = done.splats.whole(), done.report
+        if views is None or count == self.total:
+            return MergedTiles(small, report)
+        usual = usual_and_others(views)[0].resized(LONGEST)
+        if self.total >= MANY * count:
+            small = self._recoloured(small, usual, progress)
+        if gaps:
+            report = replace(report, opacity_lost=self.opacity_lost(small, usual))
+        return MergedTiles(small, report)
 
     def _recoloured(self, small: Splats, views: Cameras, progress: Progress) -> Splats:
-        chosen = seen_by(views.resized(LONGEST))
+        chosen = seen_by(views)
         drawn = TileRenders(self, chosen, opacity=True)
 
         def shown(view: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
@@ -148,8 +156,6 @@ class InTiles:
         """Return a scene that was derived from this one: in memory, or in tiles of its own if it is large."""
         if isinstance(scene, Splats):
             return InMemory(scene)
-        if len(scene) <= self.most_rows:
-            return InMemory(scene.whole())
         folder = self.folder / f"{name}-{scene.identity()[0]}"
         store = ingest(scene, folder, tile_rows=self.most_rows)
         return InTiles(store, self.workers, self.config, self.most_rows, self.folder)

@@ -38,7 +38,7 @@ class Merged:
     report: SimplifyReport
 
 
-def simplify_tiles(run: TiledRun, budget: int, views: Cameras | None = None, *, gaps: bool = False) -> Merged:
+def simplify_tiles(run: TiledRun, budget: int, views: Cameras | None = None) -> Merged:
     """Reduce a tiled scene to exactly `budget` Gaussians with method `default`.
 
     If `budget` is the scene's count, the scene is returned unchanged. Otherwise:
@@ -49,8 +49,7 @@ def simplify_tiles(run: TiledRun, budget: int, views: Cameras | None = None, *, 
     3. Each tile computes the costs of merging along Morton order. The cheapest merges of all tiles are done,
        down to three times the budget. Then each tile plans more merges of pairs than needed, and the cheapest
        of all plans are done, down to the budget (`_merged`).
-    4. Opacities are fitted to what the same views see of the result, and if `gaps` is true, these views
-       measure the opacity lost.
+    4. Opacities are fitted to what the same views see of the result.
 
     Every step is a task with a file in the folder of the run's workers, so the same call resumes. The result
     depends only on the scene, the tiles and the views, not on where, in which order or how often tasks ran.
@@ -82,12 +81,11 @@ def simplify_tiles(run: TiledRun, budget: int, views: Cameras | None = None, *, 
         return finished(small, store.sh_degree)
 
     scene = scene_in_tiles(store, counts, tile, key_of(files), store.sh_degree)
-    lost = _opacity_lost(run, merged, sights) if gaps and sights is not None else None
-    return Merged(scene, _report(run, counts, merged, seen=sights is not None, lost=lost))
+    return Merged(scene, _report(run, counts, merged, seen=sights is not None))
 
 
 def _report(
-    run: TiledRun, counts: Sequence[int], merged: list[Path], *, seen: bool = False, lost: float | None = None
+    run: TiledRun, counts: Sequence[int], merged: list[Path], *, seen: bool = False
 ) -> SimplifyReport:
     """Describe a merge; `merged` are the results of `merge`, none if nothing was merged."""
     total, left = run.store.count, sum(counts)
@@ -112,15 +110,8 @@ def _report(
         unseen=unseen if seen else None,
         faded=0,
         skipped={"alone": alone},
-        opacity_lost=lost,
         tiles=list(counts),
     )
-
-
-def _opacity_lost(run: TiledRun, merged: list[Path], sights: Sights) -> float:
-    done = run.each("gaps", "gaps", per_tile=sights.levels(), inputs=sights.beside(merged))
-    lost, opaque = np.sum([load(path, "light")[0] for path in done], axis=0)
-    return float(lost / opaque) if opaque else 0.0
 
 
 def _merged(

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g2ard import _core
-from g2ard.rendering.visibility import LONGEST, MOST_VIEWS, NEAR
+from g2ard.rendering.visibility import LONGEST, MOST_VIEWS, NEAR, usual_and_others, weight_of_others
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.samples import evenly_spaced, weighted_quantile
 from g2ard.system.keys import key_of
@@ -34,8 +34,10 @@ class Sights:
     """Visibility of a run's tiles in some views, and the frame of costs that follows from it."""
 
     def __init__(self, run: TiledRun, cameras: Cameras, frame: tuple[float, ...]):
-        self.run, self.cameras = run, cameras.resized(LONGEST)
-        self.shrunk = float((self.cameras.widths / cameras.widths).mean())
+        usual, others = usual_and_others(cameras)
+        self.run, self.usual, self.others = run, len(usual), len(others)
+        self.cameras = Cameras.of([*usual, *others]).resized(LONGEST)
+        self.shrunk = float((self.cameras.widths[: self.usual] / usual.widths).mean())
         self.views = written(run.workers.folder, self.cameras)
         self.boxes = boxes_of(run.coarse)
         light = self._light()
@@ -60,25 +62,20 @@ class Sights:
 
     def again(self, merged: list[Path]) -> list[Path]:
         """Measure what the same views see of the merged tiles."""
-        levels, inputs = self.levels(), self.beside(merged)
-        return self.run.each("merged_visibility", "merged visibility", per_tile=levels, inputs=inputs)
-
-    def levels(self) -> list[dict[str, Any]]:
-        """Return the coarse level of all tiles around each, None for itself, as argument of its tasks."""
-        return [{"levels": given["levels"]} for given in self.arguments]
-
-    def beside(self, merged: list[Path]) -> list[dict[str, Any]]:
-        """Return the inputs of tasks that see the merged tiles."""
-        return [
+        names = ("levels", "others", "others_weight")
+        levels = [{name: given[name] for name in names} for given in self.arguments]
+        inputs = [
             {**given, "merged": path, "visibility": seen}
             for given, path, seen in zip(self._inputs(), merged, self.visibility, strict=True)
         ]
+        return self.run.each("merged_visibility", "merged visibility", per_tile=levels, inputs=inputs)
 
     def _light(self) -> NDArray[np.float64]:
         """Return (V, T) Σ αT² of each tile's coarse Gaussians in each view."""
         coarse, store, workers = self.run.coarse, self.run.store, self.run.workers
         here = self.cameras.recentred(store.offset)
-        away = np.linalg.norm(here.positions[:, None] - self.boxes.mean(axis=1), axis=2).min(axis=1)
+        usual = here.positions[: self.usual, None]
+        away = np.linalg.norm(usual - self.boxes.mean(axis=1), axis=2).min(axis=1)
         level = "near" if store.count // COARSE[0] <= _MOST_NEAR_GAUSSIANS else "far"
         given = {"level": level, "near": NEAR * float(np.median(away)) or None}
         tasks = [
@@ -99,12 +96,15 @@ class Sights:
 
     def _chosen(self, light: NDArray[np.float64], tile: int) -> dict[str, Any]:
         """Choose the views of a tile, evenly spaced among those that see it."""
-        sight = in_sight(light, tile)
+        usual, others = light[: self.usual], light[self.usual :]
+        sight = in_sight(usual, tile)
         some = sight[evenly_spaced(len(sight), MOST_VIEWS)]
         return {
             "views": some.tolist(),
-            "light": light[some, tile].tolist(),
-            "all_light": float(light[:, tile].sum()) or 1.0,
+            "light": usual[some, tile].tolist(),
+            "all_light": float(usual[:, tile].sum()) or 1.0,
+            "others": (self.usual + in_sight(others, tile)).tolist(),
+            "others_weight": weight_of_others(self.usual, self.others),
         }
 
     def _levels(self, tile: int) -> list[str | None]:

@@ -25,14 +25,13 @@ from numpy.typing import NDArray
 
 from g2ard import _core
 from g2ard.io.tile_store import TileStore
-from g2ard.rendering.renderer import RasterSettings, settings_for, view_of
+from g2ard.rendering.renderer import RasterSettings, view_of
 from g2ard.rendering.visibility import CONVERGED, NEAR, ROUND, SampledVisibility, spread
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.prepared import PreparedScene, as_prepared, finite_rows_of
 from g2ard.scene.splats import Splats
 from g2ard.scene.transform import join
 from g2ard.stages.simplify import Default, SimplifyConfig, simplify
-from g2ard.stages.simplify.gaps import light_lost, some_views
 from g2ard.stages.simplify.pairs import emphasised, splats_of
 from g2ard.tiles.executor import Workers
 from g2ard.tiles.tasks import (
@@ -41,13 +40,11 @@ from g2ard.tiles.tasks import (
     Inputs,
     Places,
     Task,
-    amid,
     arrays_of,
     cameras_of,
     cropped,
     load,
     scene_of,
-    surroundings,
     tile_of,
     with_surroundings,
 )
@@ -126,9 +123,10 @@ def visibility(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
     represent all views.
 
     Args:
-        arguments: `tile`, `config`, `frame`, `levels`; `views`, numbers of the V views that see the tile;
-            `light`, (V,) Σ αT² that each gets from it (`light`); `all_light`, its sum over all views;
-            `shrunk`, the ratio of these images' width to the full width.
+        arguments: `tile`, `config`, `frame`, `levels`; `views`, numbers of the V usual views that see the
+            tile; `light`, (V,) Σ αT² that each gets from it (`light`); `all_light`, its sum over all usual
+            views; `others`, numbers of views of other kinds; `others_weight`, that of each; `shrunk`, the
+            ratio of these images' width to the full width.
         inputs: `coarse`, `views`.
 
     Returns:
@@ -144,11 +142,12 @@ def visibility(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
     distance = np.median(np.linalg.norm(here.positions - own.core.origin, axis=1)) if len(here) else 0.0
     settings = RasterSettings(antialiased=own.antialiased, near=NEAR * float(distance) or None)
     here = cropped(here, own, settings)
-    sums = _core.VisibilityAccumulator(with_surroundings(own, arguments, inputs, places).core)
+    amid = with_surroundings(own, arguments, inputs, places)
+    sums = _core.VisibilityAccumulator(amid.core)
     used = _add_until_converged(sums, here, settings, len(own))
     share = np.asarray(arguments["light"])[used].sum() / arguments["all_light"] if used else 1.0
     weight, pixel_size = (values[: len(own)] for values in sums.by_row())
-    weight = weight / np.float32(share or 1.0)
+    weight = weight / np.float32(share or 1.0) + _of_others(own, amid, cameras, settings, arguments)
     pixel_size = pixel_size * np.float32(arguments["shrunk"])  # in pixels of the full image
     pixel = _median(pixel_size[np.isfinite(pixel_size) & (pixel_size > 0)])
     unit, _, *others = arguments["frame"]  # with the tile's own pixel size
@@ -266,7 +265,7 @@ def merged_visibility(arguments: Arguments, inputs: Inputs, places: Places) -> A
     """Measure what the same views see of a tile's merged Gaussians.
 
     Args:
-        arguments: `tile`, `levels`.
+        arguments: `tile`, `levels`, `others`, `others_weight`.
         inputs: `coarse`, `views`, `visibility`; `merged`, the output of `merge`.
 
     Returns:
@@ -274,33 +273,31 @@ def merged_visibility(arguments: Arguments, inputs: Inputs, places: Places) -> A
     """
     core = as_prepared(scene_of(inputs["merged"], "scene").with_sh_degree(0))
     used, share, near = load(inputs["visibility"], "used", "share", "near")
-    cameras = cameras_of(inputs["views"]).recentred(core.offset).take(used)
+    cameras = cameras_of(inputs["views"]).recentred(core.offset)
     settings = RasterSettings(antialiased=core.antialiased, near=float(near))
-    cameras = cropped(cameras, core, settings)
-    sums = _core.VisibilityAccumulator(with_surroundings(core, arguments, inputs, places).core)
+    amid = with_surroundings(core, arguments, inputs, places)
+    weight = _sum_of(core, amid, cameras.take(used), settings) / np.float32(share)
+    return {"weight": weight + _of_others(core, amid, cameras, settings, arguments)}
+
+
+def _of_others(
+    own: PreparedScene, amid: PreparedScene, cameras: Cameras, settings: RasterSettings, arguments: Arguments
+) -> NDArray[np.float32]:
+    """Return the weighted Σ αT² of a tile's Gaussians over views of other kinds."""
+    weight = np.float32(arguments["others_weight"])
+    return weight * _sum_of(own, amid, cameras.take(arguments["others"]), settings)
+
+
+def _sum_of(
+    own: PreparedScene, amid: PreparedScene, cameras: Cameras, settings: RasterSettings
+) -> NDArray[np.float32]:
+    """Return Σ αT² of a tile's Gaussians, the first ones of `amid`, over views."""
+    if not len(cameras):
+        return np.zeros(len(own), np.float32)
+    cameras = cropped(cameras, own, settings)
+    sums = _core.VisibilityAccumulator(amid.core)
     sums.add([view_of(cameras, i, settings) for i in range(len(cameras))], settings, None)
-    return {"weight": sums.by_row()[0][: len(core)] / np.float32(share)}
-
-
-def gaps(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
-    """Measure the light that a tile's merged Gaussians let through and the dense ones stop.
-
-    Args:
-        arguments: `tile`, `levels`.
-        inputs: `merged`, the output of `merge`; `coarse`, `views` and `visibility`.
-
-    Returns:
-        `light`, (2,) what `g2ard.stages.simplify.gaps.light_lost` returns.
-    """
-    dense = tile_of(arguments, inputs, places, sh=False)
-    used, near = load(inputs["visibility"], "used", "near")
-    settings = replace(settings_for(dense.means, antialiased=dense.antialiased), near=float(near))
-    here = cameras_of(inputs["views"]).recentred(dense.offset).take(used)
-    views = some_views(cropped(here, dense, settings).recentred(-dense.offset))
-    around = surroundings(arguments, inputs, places)
-    before = amid(dense.take(dense.core.order), around)
-    after = amid(scene_of(inputs["merged"], "scene"), around)
-    return {"light": np.array(light_lost(before, after, views, settings))}
+    return sums.by_row()[0][: len(own)]
 
 
 def _config(arguments: Arguments) -> Default:

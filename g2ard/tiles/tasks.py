@@ -198,18 +198,9 @@ def tile_of(arguments: Arguments, inputs: Inputs, places: Places, *, sh: bool = 
 
 def with_surroundings(core: Splats, arguments: Arguments, inputs: Inputs, places: Places) -> PreparedScene:
     """Join a tile's Gaussians with its halo and the coarse Gaussians of all other tiles beyond the halo."""
-    return as_prepared(amid(core, surroundings(arguments, inputs, places)))
-
-
-def surroundings(arguments: Arguments, inputs: Inputs, places: Places) -> list[Splats]:
-    """Return a tile's halo and the coarse Gaussians of all other tiles beyond it."""
     store = TileStore.open(places["store"])
-    return [store.read_halo(arguments["tile"], sh=False), *far_around(store, arguments, inputs)]
-
-
-def amid(core: Splats, around: list[Splats]) -> Splats:
-    """Join a tile's Gaussians with others, all of SH degree 0."""
-    return join([part.with_sh_degree(0) for part in [core, *around] if len(part)])
+    around = [store.read_halo(arguments["tile"], sh=False), *far_around(store, arguments, inputs)]
+    return as_prepared(join([part.with_sh_degree(0) for part in [core, *around] if len(part)]))
 
 
 def far_around(store: TileStore, arguments: Arguments, inputs: Inputs) -> list[Splats]:

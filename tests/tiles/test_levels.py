@@ -80,7 +80,7 @@ def test_levels_on_disk_give_the_files_of_levels_in_memory(tmp_path: Path, degre
 
 
 def levels_in_tiles(place: Path, folder: Path, say: Say = unsaid) -> Levels[Any]:
-    options: dict[str, Any] = {"ratios": (1, 3, 12), "recover": True, "steps": 12, "background": (0, 0, 0)}
+    options: dict[str, Any] = {"ratios": (1, 3, 12), "recover": True, "steps": 30, "background": (0, 0, 0)}
     options |= {"split_sky": False, "seed": 0, "views": place / "views.json", "size": 64, "say": say}
     tiling = Tiling(tile_rows=850, workers=1, folder=folder)
     with preparing_levels(Source(place / "town.ply"), tiling, **options) as job:
