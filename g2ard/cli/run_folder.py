@@ -35,6 +35,7 @@ from g2ard.jobs.budget import DEVICES, Budget
 from g2ard.jobs.cost import LARGEST_DENSE
 from g2ard.jobs.viewer_frame import backdrop, frame_with
 from g2ard.pipeline.distill import RunViews
+from g2ard.rendering.targets import fill
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats
 from g2ard.viewer.page import write_page
@@ -200,10 +201,11 @@ class RunFolder:
         renderers, best, drawn = renderers_of(scenes, recover.background), None, []
         with self._run.showing("choosing views for report.html"):
             best = job.best(done)
-            drawn = [pictures(best, row, list(renderers.values())) for row in range(len(best.cameras))]
-        if best is None or not drawn:
+            fill(best, self._run.progress)
+        if best is None:
             return report, ""
         with self._run.showing(_PICTURE):
+            drawn = [pictures(best, row, list(renderers.values())) for row in range(len(best.cameras))]
             preview(self.path / _PICTURE, drawn, scenes)
         line = ""
         if self._run.config["page"]:

@@ -33,7 +33,7 @@ def describe(given: str | Path | ViewFiles, more: Callable[[Splats], Json] | Non
         99th percentiles} and `notes` [{code, count, text}]. Scenes add `sh_degree`, `render_model`, `odd`,
         and `opacity`, `largest_scale`, `smallest_scale`, `elongation` as quantiles by percentage. Point
         clouds add `color`, views `photos`, `sizes`, `fov_degrees`, `splits`. Point clouds and tiles of a map
-        add its `map_system`.
+        add its `map_system`, point clouds `metres_per_unit` (None if the file does not state it).
     """
     source = Source(str(given))
     path = source.path
@@ -49,6 +49,8 @@ def describe(given: str | Path | ViewFiles, more: Callable[[Splats], Json] | Non
         notes, figures = (*views.notes, *_photo_notes(views.cameras)), _views(views)
     system = source.map_system
     figures |= {} if system is None else {"map_system": system}
+    if source.kind == "points":
+        figures["metres_per_unit"] = source.metres_per_unit
     return {
         "path": str(path),
         "kind": source.kind,

@@ -46,14 +46,14 @@ class Stream(PointStream):
                 runs.append(reader.read_points(min(_SAMPLE_ROWS, count - first)))
             text = f"the header states 0 points; {count:,} follow, and are read"
             notes = (Note("header_count", count, text),) if reader.recovered else ()
-            system = _system(header)
+            system, metres_per_unit = _system(header), _metres_per_unit(header)
 
         def sampled(color: Names) -> list[MarkedPoints]:
             return [_points(run, color) for run in runs] or [_NOTHING]
 
         self._color, sample = telling(choices, sampled)
         super().__init__(path, count, sample, judge.full_scales(np.dtype(np.uint16)), notes=notes)
-        self.system, self.axes = system, "RFU"
+        self.system, self.axes, self.metres_per_unit = system, "RFU", metres_per_unit
         if choices[0] != _RGB:
             number = header.point_format.id
             self.lack = (
@@ -93,6 +93,24 @@ def _system(header: Any) -> str | None:
                 own = re.split(r"VERT_?C(?:S|RS)\[", found[2])[0]
                 code = re.search(r'(?:AUTHORITY|ID)\["EPSG",\s*"?(\d+)"?\][\]\s,\0]*$', own)
                 return f"EPSG:{code[1]}" if code else found[1]
+    return None
+
+
+_UNITS = {9001: 1.0, 9002: 0.3048, 9003: 1200 / 3937}
+"""Code of a unit of length in GeoTIFF keys → its metres."""
+
+
+def _metres_per_unit(header: Any) -> float | None:
+    """Return the metres of the unit of positions, if a header states its map system."""
+    for record in header.vlrs:
+        if record.record_id == 34735 and hasattr(record, "geo_keys"):
+            codes = {key.id: key.value_offset for key in record.geo_keys}
+            if codes.get(3076) in _UNITS:
+                return _UNITS[codes[3076]]
+        if record.record_id == 2112 and hasattr(record, "string") and "PROJ" in record.string:
+            own = re.split(r"VERT_?C(?:S|RS)\[", record.string[record.string.index("PROJ") :])[0]
+            if found := re.findall(r'UNIT\["[^"]*",\s*([0-9.eE+-]+)', own):
+                return float(found[-1])
     return None
 
 

@@ -103,6 +103,11 @@ class Source:
         return None if store is None else store.system
 
     @property
+    def metres_per_unit(self) -> float | None:
+        """Metres of the unit of a point cloud that states it."""
+        return self._points.metres_per_unit if self.kind == "points" else None
+
+    @property
     def notes(self) -> Notes:
         """Notes on the scene's file, known once it has been read."""
         return self.scene.all_notes()

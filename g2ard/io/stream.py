@@ -212,6 +212,7 @@ class PointStream(Stream[RawPoints]):
         lack: why there are no colours.
         todo: what to do then, if not the usual.
         system: the map system that the file states.
+        metres_per_unit: of its positions, if the file states it.
         axes: axes of the coordinates: z is up in maps; None if neither the format nor a map tells.
     """
 
@@ -245,6 +246,7 @@ class PointStream(Stream[RawPoints]):
         self.channels, self.scales = values.shape[1], scales
         self.lack, self.todo = "has neither colours nor intensities that vary", ""
         self.system: str | None = None
+        self.metres_per_unit: float | None = None
         self.axes: Axes | None = "RFU" if far else None
         self._range = 0.0, 1.0
         if self.channels == 3:
@@ -419,6 +421,7 @@ class JoinedClouds(Joined[RawPoints], PointStream):
             words = ", ".join(f"{name} in {system}" for system, name in reversed(stated.items()))
             raise InputError(f"several map systems: {words}; project all to one first", path=streams[0].path)
         self.system = next(iter(stated), None)
+        self.metres_per_unit = next((s.metres_per_unit for s in streams if s.metres_per_unit), None)
         self.notes = tuple(_far_apart(streams))
 
     def header_notes(self) -> Notes:

@@ -151,3 +151,14 @@ def test_info_continues_after_unreadable_files(command_line: CommandLine, folder
     result = json.loads(out)
     assert (status, result["failed"]) == (1, ["gone.ply", "text.ply"])
     assert [figures["kind"] for figures in result["files"]] == ["splats", "views"]
+
+
+def test_a_point_cloud_states_its_unit_and_rounded_figures(tmp_path: Path, command_line: CommandLine) -> None:
+    colors = np.tile([[156, 153, 136]], (3, 1)).astype(np.uint8)
+    write_points(
+        tmp_path / "a.ply", Points(np.array([[0, 0, 0], [2000.123, 10, 5], [9, 9, 9]]), colors / 255)
+    )
+    told = succeeds(command_line, tmp_path, "info", "a.ply").out
+    assert re.search(r"unit\W+not stated in the file", told)
+    assert re.search(r"extent\W+\(0, 0, 0\) to \(2,000, 10, 9\)", told)
+    assert re.search(r"mean colour\W+\(0\.61, 0\.60, 0\.53\)", told)

@@ -388,11 +388,11 @@ def test_whole_metres_are_not_those_of_float32(tmp_path: Path) -> None:
     assert "coarse_positions" not in [note.code for note in found.notes]
 
 
-def systems(path: Path, code: int | None, wkt: str | None) -> Path:
+def systems(path: Path, code: int | None, wkt: str | None, key: int = 3072) -> Path:
     header = laspy.LasHeader(point_format=7, version="1.4")
     if code:
         record = laspy.vlrs.known.GeoKeyDirectoryVlr()
-        record.parse_record_data(struct.pack("<8H", 1, 1, 0, 1, 3072, 0, 1, code))
+        record.parse_record_data(struct.pack("<8H", 1, 1, 0, 1, key, 0, 1, code))
         header.vlrs.append(record)
     if wkt:
         header.vlrs.append(laspy.vlrs.known.WktCoordinateSystemVlr(wkt))
@@ -430,6 +430,28 @@ def test_several_map_systems_are_refused(tmp_path: Path, a: tuple, b: tuple, sev
     stream = stream_of(paths)
     assert not stream.header_notes()
     assert stream.system == "EPSG:32632"
+
+
+FEET = 'PROJCS["Oregon",GEOGCS["G",UNIT["degree",0.01745]],UNIT["{}",{}],AXIS["X",EAST]]'
+
+
+@pytest.mark.parametrize(
+    ("code", "wkt", "metres"),
+    [
+        (None, FEET.format("US survey foot", 0.3048006096), 1200 / 3937),
+        (None, f'COMPD_CS["x",{FEET.format("foot", 0.3048)},VERT_CS["h",UNIT["metre",1]]]', 0.3048),
+        (None, 'PROJCRS["A",CS[Cartesian,2],AXIS["(E)",east],LENGTHUNIT["metre",1],ID["EPSG",2056]]', 1.0),
+        (9002, None, 0.3048),
+        (None, None, None),
+    ],
+)
+def test_the_unit_of_a_scan_is_its_map_system_s(
+    code: int | None, wkt: str | None, metres: float | None, tmp_path: Path
+) -> None:
+    path = systems(tmp_path / "a.las", code, wkt, key=3076)
+    several = stream_of([path, systems(tmp_path / "b.las", None, None)])
+    for found in (Source(path).metres_per_unit, several.metres_per_unit):
+        assert found == (metres and pytest.approx(metres, rel=1e-6))
 
 
 @pytest.mark.parametrize("value", [0.0, np.nan, np.inf])

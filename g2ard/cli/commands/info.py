@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -167,23 +168,28 @@ def _rows(figures: dict[str, Any]) -> list[list[str]]:
         rows.append(["SH degree", str(figures["sh_degree"])])
         rows.append(["render model", figures["render_model"]])
     if any(figures.get("offset", ())):
-        rows.append(["offset", _vector(figures["offset"])])
+        rows.append(["offset", _vector(figures["offset"], 3)])
     if "map_system" in figures:
         rows.append(["map system", figures["map_system"]])
+    if "metres_per_unit" in figures:
+        rows.append(["unit", _unit(figures["metres_per_unit"])])
     extent = figures["extent"]
-    rows.append(["extent", f"{_vector(extent['min'])} … {_vector(extent['max'])}"])
-    rows.append(["1 % to 99 %", f"{_vector(extent['robust_min'])} … {_vector(extent['robust_max'])}"])
-    for key in ("opacity", "largest_scale", "smallest_scale", "elongation", "fov_degrees"):
+    longest = max(high - low for low, high in zip(extent["min"], extent["max"], strict=True))
+    digits = max(0, 3 - math.floor(math.log10(longest or 1)))
+    low, high, near, far = (
+        _vector(extent[name], digits) for name in ("min", "max", "robust_min", "robust_max")
+    )
+    rows += [["extent", f"{low} to {high}"], ["98 % of it", f"{near} to {far}"]]
+    for key in ("opacity", "largest_scale", "smallest_scale", "elongation"):
         if key in figures:
-            quantiles = figures[key]
-            named = {"0": "least", "50": "median", "100": "most"}
-            told = (f"{named.get(at, f'{at} %')} {value:.3g}" for at, value in quantiles.items())
-            rows.append([key.replace("_", " "), ", ".join(told)])
+            rows.append([key.replace("_", " "), _spread(figures[key])])
+    if "fov_degrees" in figures:
+        rows.append(["field of view", _spread(figures["fov_degrees"], "°")])
     if "close_overdraw" in figures:
         close = figures["close_overdraw"]
         rows.append(["Gaussians per pixel, near", f"{close['mean']:.0f}, at worst {close['worst']:.0f}"])
     if "color" in figures:
-        rows.append(["mean colour", _vector(figures["color"]["mean"])])
+        rows.append(["mean colour", _vector(figures["color"]["mean"], 2)])
     rows += [[key, f"{figures[key]:,}"] for key in ("photos", "distorted") if key in figures]
     if "sparse_points" in figures:
         rows.append(["sparse points", f"{figures['sparse_points']:,}"])
@@ -192,8 +198,36 @@ def _rows(figures: dict[str, Any]) -> list[list[str]]:
     return rows + [["note", note["text"]] for note in figures["notes"]]
 
 
-def _vector(values: list[float]) -> str:
-    return "(" + ", ".join(f"{value:,.7g}" for value in values) + ")"
+def _spread(quantiles: dict[str, float], unit: str = "") -> str:
+    """Describe a distribution by its quantiles.
+
+    >>> _spread({"0": 0.001, "1": 0.01, "25": 0.1, "50": 0.25, "75": 0.5, "99": 0.9, "100": 1.0})
+    'median 0.25, half from 0.1 to 0.5, all from 0.001 to 1'
+    >>> _spread(dict.fromkeys(("0", "1", "25", "50", "75", "99", "100"), 42.87), "°")
+    '42.9°'
+    """
+    least, lower, median, upper, most = (
+        f"{quantiles[at]:.3g}{unit}" for at in ("0", "25", "50", "75", "100")
+    )
+    if least == most:
+        return median
+    return f"median {median}, half from {lower} to {upper}, all from {least} to {most}"
+
+
+def _unit(metres: float | None) -> str:
+    """Name a unit of length.
+
+    >>> _unit(1200 / 3937), _unit(None)
+    ('US survey foot', 'not stated in the file')
+    """
+    if metres is None:
+        return "not stated in the file"
+    named = {1.0: "metre", 0.3048: "foot", 0.3048006: "US survey foot"}
+    return named.get(round(metres, 7), f"{metres:g} m")
+
+
+def _vector(values: list[float], digits: int) -> str:
+    return "(" + ", ".join(f"{value:,.{digits}f}" for value in values) + ")"
 
 
 def _size(count: int) -> str:
