@@ -2,7 +2,7 @@
 
 import sys
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, Protocol
 
 
@@ -108,6 +108,15 @@ class Detail(str):
 
 def unsaid(text: str) -> None:
     """Say nothing."""
+
+
+def some(names: Sequence[Any], most: int = 3) -> str:
+    """Return the first names or numbers, and … if there are more.
+
+    >>> some([1, 2, 3]), some("abcd")
+    ('1, 2, 3', 'a, b, c, …')
+    """
+    return ", ".join([*map(str, names[:most]), *(["…"] if len(names) > most else [])])
 
 
 def plural(count: int, one: str, many: str | None = None) -> str:

@@ -11,7 +11,7 @@ from g2ard.io.finding import Finder
 from g2ard.io.jsonfile import Place
 from g2ard.io.paths import read_text
 from g2ard.io.photos import Frame, Lens, Listed, photo_size, posed
-from g2ard.io.types import Float, Note, ViewFiles
+from g2ard.io.types import Float, ViewFiles
 
 _PHOTO_SIZE = (1920, 1080)  # size of the original photos, for which focal lengths are given
 _SPLIT_FILES = {"train": "dataset_train.txt", "test": "dataset_test.txt"}
@@ -45,7 +45,7 @@ def read(views: ViewFiles) -> Listed:
             photo = finder.photo(photo_name)
             frames.append(_frame(path / name, photo_name, pose, lens or (median, 0.0), photo, split))
     text = f"{guessed} views are not in {_NVM_FILE}; they get the median focal length, {median:.1f}"
-    return Listed(path, frames, notes=(Note("guessed_focal", guessed, text),) if guessed else ())
+    return Listed(path, frames).noted("guessed_focal", guessed, text)
 
 
 def _frame(where: Path, name: str, pose: Float, lens: tuple[float, float], photo: Path, split: str) -> Frame:

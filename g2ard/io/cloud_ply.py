@@ -41,7 +41,7 @@ class Stream(PointStream):
         (self._vertices,) = read_element(path, header, "vertex")
         rows = spread_rows(self._vertices)
         choices = [names for names in COLOR_NAMES if set(names) <= set(self._named)]
-        choices += [[name] for name in (*_PACKED, *_INTENSITIES) if name in self._named]
+        choices += [(name,) for name in (*_PACKED, *_INTENSITIES) if name in self._named]
         kinds = {name: self._vertices.dtype[own] for name, own in self._named.items()}
         choices = [names for names in choices if names[0] not in _PACKED or kinds[names[0]].itemsize == 4]
 
@@ -49,7 +49,7 @@ class Stream(PointStream):
             self._names = names
             return [self._marked(rows)]
 
-        self._names, sample = telling([*map(tuple, choices)], sampled)
+        self._names, sample = telling(choices, sampled)
         packed = self._names and self._names[0] in _PACKED
         scales = [(255.0,)] if packed else [judge.full_scales(kinds[name]) for name in self._names]
         widest = max(scales, key=lambda scales: scales[-1], default=(1.0,))

@@ -33,18 +33,6 @@ _TRIPLES = {6: (3,), 7: (4, 3), 8: (5, 4, 3), 9: (6, 3), 10: (7, 6, 4, 3)}
 
 _ALIKE = 0.5  # least correlation of the channels of colours that tells them from other columns
 
-_TYPES = {
-    "F4": "<f4",
-    "F8": "<f8",
-    "U1": "u1",
-    "U2": "<u2",
-    "U4": "<u4",
-    "I1": "i1",
-    "I2": "<i2",
-    "I4": "<i4",
-}
-"""Types of .pcd by letter and size."""
-
 _LINES, _HEAD = 50, 1 << 16  # lines that may be a heading, and bytes that tell whether a text is a table
 
 
@@ -163,10 +151,9 @@ def _pcd(path: Path) -> tuple[list[str], Float]:
     head = {line[0]: line[1:] for line in words if line}
     try:
         fields, count = head["FIELDS"], int(head["POINTS"][0])
-        counts = map(int, head["COUNT"] if "COUNT" in head else "1" * len(fields))
-        kinds = [kind.lower() + size for kind, size in zip(head["TYPE"], head["SIZE"], strict=True)]
+        shapes = zip(head["TYPE"], head["SIZE"], head.get("COUNT") or "1" * len(fields), strict=True)
         rows = np.dtype(
-            [(f"{i}", f"<{kind}", (n,)) for i, (kind, n) in enumerate(zip(kinds, counts, strict=True))]
+            [(f"{i}", f"<{kind.lower()}{size}", (int(n),)) for i, (kind, size, n) in enumerate(shapes)]
         )
         if how == "ascii":
             values = np.loadtxt(io.StringIO(plain_numbers(body.decode("latin-1"))), ndmin=2)

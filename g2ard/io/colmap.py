@@ -16,10 +16,10 @@ import numpy as np
 from g2ard.errors import InputError, damaged
 from g2ard.io.finding import Finder, files_in
 from g2ard.io.jsonfile import Place
-from g2ard.io.paths import read_text
+from g2ard.io.paths import about, read_text
 from g2ard.io.photos import Frame, Lens, Listed, posed
 from g2ard.io.transforms import intrinsics_of
-from g2ard.io.types import Float, Note, ViewFiles
+from g2ard.io.types import Float, ViewFiles
 from g2ard.progress import plural
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.lenses import PARAMETERS, PhotoLens
@@ -154,14 +154,13 @@ def incomplete(path: Path) -> InputError | None:
 @contextmanager
 def parsing(path: Path) -> Iterator[None]:
     """Turn parsing errors into an `InputError` that names the file."""
-    try:
-        yield
-    except InputError:
-        raise
-    except (ValueError, IndexError, KeyError, OverflowError) as error:
-        raise InputError(f"malformed ({error})", path=path) from error
-    except OSError as error:
-        raise InputError(f"{error.strerror}", path=path) from error
+    with about(path):
+        try:
+            yield
+        except InputError:
+            raise
+        except (ValueError, IndexError, KeyError, OverflowError) as error:
+            raise InputError(f"malformed ({error})") from error
 
 
 def read(views: ViewFiles) -> Listed:
@@ -178,7 +177,7 @@ def read(views: ViewFiles) -> Listed:
         return found
     largest = max(others, key=_count)
     text = f"read {found.path} of {len(others) + 1} models; {largest} has {plural(_count(largest), 'image')}"
-    return found._replace(notes=(*found.notes, Note("other_models", len(others), text)))
+    return found.noted("other_models", len(others), text)
 
 
 def listed(views: ViewFiles) -> Listed:
@@ -220,8 +219,7 @@ def listed(views: ViewFiles) -> Listed:
             continue
         frames.append(Frame(name, pose, camera, finder.photo(name), listed=name))
     text = f"{plural(stale, 'pose')} of {tables[1].name} differ from rigs and frames, which count"
-    notes = (Note("stale_poses", stale, text),) if stale else ()
-    return Listed(folder, frames, faults, (*finder.notes, *notes))
+    return Listed(folder, frames, faults, finder.notes).noted("stale_poses", stale, text)
 
 
 _SAME = 1e-5  # difference of poses that rounding may cause
@@ -230,12 +228,12 @@ _SAME = 1e-5  # difference of poses that rounding may cause
 def _photo_folders(path: Path, model: Path) -> tuple[list[Path], list[Path]]:
     """Return folders of photos: `images` beside `path`, the model or up to three folders above it; and where
     photos may be otherwise, up to the project's folder, which is above `sparse`."""
-    roots = (path, model, model.parent, model.parent.parent, model.parent.parent.parent)
-    found = [root / "images" for root in roots if (root / "images").is_dir()]
+    beside = (root / "images" for root in (path, model, *model.parents[:3]))
+    found = next(filter(Path.is_dir, beside), path / "images")
     project = model
     while project.name.isdecimal() or project.name in ("sparse", "colmap"):
         project = project.parent
-    return found[:1] or [path / "images"], [path, model, project]
+    return [found], [path, model, project]
 
 
 class Columns(NamedTuple):
@@ -404,26 +402,23 @@ def open_table(path: Path, item: str) -> Table:
     return (TextTable if path.suffix.lower() == ".txt" else Table)(path, item)
 
 
-def _camera(path: Path, model: str, size: tuple[int, int], p: tuple[float, ...]) -> Lens:
+def _camera(model: str, size: tuple[int, int], p: tuple[float, ...]) -> Lens:
     if model not in _PARAMETERS:
         raise InputError(
             f"unsupported camera model {model}; expected {', '.join(_PARAMETERS)}",
-            path=path,
             hint="undistort with COLMAP",
         )
     if len(p) != _PARAMETERS[model]:
-        raise InputError(f"{model} takes {_PARAMETERS[model]} parameters, got {len(p)}", path=path)
+        raise InputError(f"{model} takes {_PARAMETERS[model]} parameters, got {len(p)}")
     if model not in _PINHOLES:
         lens = PhotoLens(model, size, p[: PARAMETERS[model]])
         if min(size) < 1 or min(lens.focal) <= 0:
-            raise InputError(f"invalid camera of {size[0]:,}×{size[1]:,} pixels", path=path)
+            raise InputError(f"invalid camera of {size[0]:,}×{size[1]:,} pixels")
         return Lens.of(lens)
     single_focal = model in ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
     fx, fy, cx, cy, *k = (p[0], *p) if single_focal else p
     if min(size) < 1 or min(fx, fy) <= 0:
-        raise InputError(
-            f"invalid camera of {size[0]:,}×{size[1]:,} pixels and focal lengths {fx}, {fy}", path=path
-        )
+        raise InputError(f"invalid camera of {size[0]:,}×{size[1]:,} pixels and focal lengths {fx}, {fy}")
     k1, k2, p1, p2 = (*k, 0.0, 0.0, 0.0, 0.0)[:4]
     return Lens.pinhole(size, (fx, fy), (cx, cy), (k1, k2, p1, p2, 0.0))
 
@@ -434,7 +429,7 @@ def _cameras(table: Table) -> dict[int, Lens | InputError]:
         key, kind, *size = table.take(_CAMERA)
         model, params = table.params(kind)
         fault = table.fault(_params(len(params)), params)
-        cameras[key] = fault or _camera(table.path, model, (size[0], size[1]), params)
+        cameras[key] = fault or _camera(model, (size[0], size[1]), params)
     return cameras
 
 

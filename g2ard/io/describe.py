@@ -75,13 +75,8 @@ def _quantiles(values: Values) -> dict[str, float]:
 
 
 def _extent(positions: Values) -> dict[str, list[float]]:
-    low, high = np.percentile(positions, (1, 99), axis=0)
-    return {
-        "min": positions.min(0).tolist(),
-        "max": positions.max(0).tolist(),
-        "robust_min": low.tolist(),
-        "robust_max": high.tolist(),
-    }
+    ends = np.percentile(positions, (0, 100, 1, 99), axis=0).tolist()
+    return dict(zip(("min", "max", "robust_min", "robust_max"), ends, strict=True))
 
 
 def _splats(splats: Splats) -> Json:

@@ -209,16 +209,16 @@ def read(views: ViewFiles) -> Listed:
         if not nodes:
             raise InputError("holds no photos", path=path, hint="give views with photos of their own")
         folder = _cache_of(path)
-        found = [_frame(path, number, node, folder) for number, node in enumerate(nodes)]
+        found = [_frame(number, node, folder) for number, node in enumerate(nodes)]
     frames = [frame for frame in found if isinstance(frame, Frame)]
     left_out = [reason for reason in found if isinstance(reason, str)]
     if not frames:
         raise InputError(f"none of its {plural(len(nodes), 'photo')} can be used: {left_out[0]}", path=path)
     text = f"{plural(len(left_out), 'photo')} of {len(nodes)} left out: {left_out[0] if left_out else ''}"
-    return Listed(path, frames, notes=(Note("left_out_photos", len(left_out), text),) if left_out else ())
+    return Listed(path, frames).noted("left_out_photos", len(left_out), text)
 
 
-def _frame(path: Path, number: int, node: Any, folder: Path) -> Frame | str:
+def _frame(number: int, node: Any, folder: Path) -> Frame | str:
     """Return the view of a photo, or the reason why it cannot be used."""
     named = str(node["name"].value()) if node.isDefined("name") else ""
     stem = "_".join(filter(None, [f"{number:04d}", _NO_NAME.sub("_", named).strip("_.")[:80]]))

@@ -6,7 +6,7 @@ from g2ard.errors import InputError
 from g2ard.io import colmap
 from g2ard.io.photos import Listed
 from g2ard.io.trainer_yaml import below, read_settings
-from g2ard.io.types import Note, ViewFiles
+from g2ard.io.types import ViewFiles
 
 NAME = "cfg.yml"
 
@@ -60,7 +60,5 @@ def read(views: ViewFiles) -> Listed:
         raise InputError(f"is {every!r}, expected a whole number ≥ 1", path=file, property="test_every")
     words = ["train" if i % int(every) else "test" for i in range(len(frames))]
     split = Listed(found.path, [f._replace(split=word) for f, word in zip(frames, words, strict=True)])
-    if settings.word("pose_opt") != "true":
-        return split
     text = "the run optimised its poses; these are the poses before training"
-    return split._replace(notes=(Note("optimised_poses", len(frames), text),))
+    return split.noted("optimised_poses", len(frames) * (settings.word("pose_opt") == "true"), text)

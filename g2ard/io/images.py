@@ -523,37 +523,36 @@ def write_animation(
     A .gif rounds their duration to hundredths of a second.
     """
     check_animation(path)
-    frames = _one_size(path, iter(pictures))
+    shown = iter(pictures)
+    first = next(shown)
+    frames = _of_size(path, first.shape, itertools.chain([first], shown))
     with atomic_output(path, overwrite) as temporary:
         if path.suffix.lower() == ".mp4":
-            _encode(temporary, frames, fps)
+            _encode(temporary, (first.shape[1], first.shape[0]), frames, fps)
             return
-        first, *rest = [Image.fromarray(frame) for frame in frames]
+        image, *rest = [Image.fromarray(frame) for frame in frames]
         options: dict[str, Any] = {"duration": 1000 / fps, "loop": 0, "quality": 80, "optimize": True}
-        first.save(temporary, save_all=True, append_images=rest, **options)
+        image.save(temporary, save_all=True, append_images=rest, **options)
 
 
-def _one_size(path: Path, frames: Iterator[Bytes]) -> Iterator[Bytes]:
-    first = next(frames)
-    for frame in itertools.chain([first], frames):
-        if frame.shape != first.shape:
-            sizes = " and ".join(f"{width}×{height}" for height, width, _ in (first.shape, frame.shape))
+def _of_size(path: Path, shape: tuple[int, ...], frames: Iterable[Bytes]) -> Iterator[Bytes]:
+    for frame in frames:
+        if frame.shape != shape:
+            sizes = " and ".join(f"{width}×{height}" for height, width, _ in (shape, frame.shape))
             raise InputError(f"views of one size make an animation, got {sizes}", path=path)
         yield np.ascontiguousarray(frame)
 
 
-def _encode(path: Path, frames: Iterator[Bytes], fps: float) -> None:
+def _encode(path: Path, size: Size, frames: Iterable[Bytes], fps: float) -> None:
     """Pipe raw frames to ffmpeg; H.264 with 4:2:0 needs even sides, so odd ones lose a pixel."""
-    first = next(frames)
-    height, width = first.shape[:2]
     command = ["ffmpeg", "-y", "-loglevel", "error", "-f", "rawvideo", "-pix_fmt", "rgb24"]
-    command += ["-s", f"{width}x{height}", "-r", f"{fps:g}", "-i", "-"]
+    command += ["-s", f"{size[0]}x{size[1]}", "-r", f"{fps:g}", "-i", "-"]
     command += ["-vf", "crop=trunc(iw/2)*2:trunc(ih/2)*2", "-pix_fmt", "yuv420p", "-crf", "18", str(path)]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE) as process:
         assert process.stdin is not None
         assert process.stderr is not None
         try:
-            for frame in itertools.chain([first], frames):
+            for frame in frames:
                 process.stdin.write(frame.tobytes())
             process.stdin.close()
         except BrokenPipeError:

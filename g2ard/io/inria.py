@@ -10,7 +10,7 @@ from g2ard.io.finding import Finder
 from g2ard.io.jsonfile import Matrix, Number, Place, Vector, Whole, checked, read_any_json
 from g2ard.io.photos import Frame, Lens, Listed, inverse, rigid
 from g2ard.io.transforms import json_rows
-from g2ard.io.types import Note, ViewFiles
+from g2ard.io.types import ViewFiles
 from g2ard.progress import plural
 from g2ard.scene.cameras import Cameras
 
@@ -48,8 +48,7 @@ def read(views: ViewFiles) -> Listed:
             frames[i] = frame._replace(name=f"{frame.name}_{i if listed[i].id is None else listed[i].id}")
     repeated = sum(count for count in times.values() if count > 1)
     text = f"{plural(repeated, 'camera')} of {len(frames)} have repeated names; their ids are appended"
-    notes = (*among.notes, Note("repeated_names", repeated, text)) if repeated else among.notes
-    return Listed(file, frames, notes=notes)
+    return Listed(file, frames, notes=among.notes).noted("repeated_names", repeated, text)
 
 
 def _frame(place: Place, camera: _Camera, finder: Finder | None) -> Frame:

@@ -21,6 +21,9 @@ _SECTION = np.dtype(
 """Header of a section."""
 
 _SH_COUNTS = {0: 0, 1: 9, 2: 24, 3: 45}
+_SH_ORDER = np.concatenate([np.arange(a, b).reshape(3, -1).T.ravel() for a, b in ((0, 9), (9, 24), (24, 45))])
+"""Columns of harmonics, which are stored channel after channel per band, in the order of `Splats`."""
+
 _SH_RANGE = (-1.5, 1.5)  # range of 8-bit harmonics if the header gives none
 _SCALE_RANGE = 32767  # half of the steps of a 16-bit position within its bucket, if a section gives none
 
@@ -95,9 +98,7 @@ def _rows(
     values = rows["sh"].astype(np.float64)
     if level == 2:
         values = values / 255 * (limits[1] - limits[0]) + limits[0]
-    for first, last in ((0, 9), (9, 24), (24, 45))[: section["degree"]]:
-        band = values[:, first:last].reshape(count, 3, (last - first) // 3)
-        raw.shN[:, first // 3 : last // 3] = band.transpose(0, 2, 1)
+    raw.shN[:] = values[:, _SH_ORDER[:harmonics]].reshape(raw.shN.shape)
     return raw, end
 
 

@@ -13,7 +13,7 @@ from g2ard.io import colmap, transforms
 from g2ard.io.jsonfile import Place, Pose, Positive, checked, read_json
 from g2ard.io.photos import Frame, Listed, inverse, rigid
 from g2ard.io.trainer_yaml import Settings, below, read_settings
-from g2ard.io.types import Float, Note, ViewFiles
+from g2ard.io.types import Float, ViewFiles
 from g2ard.scene.samples import evenly_spaced
 
 NAME = "dataparser_transforms.json"
@@ -56,10 +56,8 @@ def read(views: ViewFiles) -> Listed:
     trained_from_saved = rigid(D @ np.linalg.inv(A), place.to("transform"))
     found = Listed(file, [_moved(frame, trained_from_saved, scale) for frame in frames])
     mode = _optimized(settings)
-    if mode is None:
-        return found
     text = f"the run optimised its poses ({mode}); these are the poses before training"
-    return found._replace(notes=(Note("optimised_poses", len(frames), text),))
+    return found.noted("optimised_poses", len(frames) if mode else 0, text)
 
 
 def _data(views: ViewFiles, settings: Settings | None) -> tuple[Sequence[Frame], Float, float]:

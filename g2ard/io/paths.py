@@ -50,18 +50,18 @@ def check_unpacked(packed: int, unpacked: int, path: Path | None = None) -> None
 
 @contextmanager
 def about(path: Path) -> Iterator[None]:
-    """Let errors in the block that name no file name this one."""
+    """Let errors in the block that name no file name this one, also those of the system."""
     try:
         yield
     except G2ardError as error:
         raise error.at(path=error.path or path) from error.__cause__
+    except OSError as error:
+        raise InputError(error.strerror or str(error), path=path) from error
 
 
 def read_text(path: Path) -> str:
-    try:
+    with about(path):
         return decoded(path, path.read_bytes())
-    except OSError as error:
-        raise InputError(error.strerror or str(error), path=path) from error
 
 
 def decoded(path: Path, data: bytes) -> str:
@@ -136,14 +136,8 @@ def file_identity(files: Iterable[Path]) -> list[Any]:
 
 def content_hash(path: Path) -> str:
     """Return the SHA-256 of a file in hexadecimal digits, which takes 1 % of the time to decode a photo."""
-    digest = hashlib.sha256()
-    try:
-        with path.open("rb") as file:
-            while block := file.read(1 << 20):
-                digest.update(block)
-    except OSError as error:
-        raise InputError(f"{error.strerror}", path=path) from error
-    return digest.hexdigest()
+    with about(path), path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def user_cache() -> Path:

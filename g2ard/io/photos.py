@@ -113,6 +113,10 @@ class Listed(NamedTuple):
     left_out: Sequence[tuple[str, InputError]] = ()
     notes: Notes = ()
 
+    def noted(self, code: str, count: int, text: str) -> Listed:
+        """Return the views with a further note, if it counts anything."""
+        return self._replace(notes=(*self.notes, Note(code, count, text))) if count else self
+
     def whole(self) -> Sequence[Frame]:
         """Return the frames, or raise the error of the first view that is left out."""
         if self.left_out:
@@ -261,17 +265,14 @@ def inverse(matrix: Float) -> Float:
 def _cameras(path: Path, frames: Sequence[Frame]) -> Cameras:
     masks = Finder()
     try:
-        return Cameras.from_lists(
-            [f.viewmat for f in frames],
-            [f.lens.K for f in frames],
-            [f.lens.size for f in frames],
-            [f.name for f in frames],
-            [f.photo for f in frames],
-            [f.lens.distortion for f in frames],
-            [_mask(f, masks) for f in frames],
-            [f.kind for f in frames],
-            [f.lens.photo for f in frames],
+        rows = (
+            (
+                *(f.viewmat, f.lens.K, f.lens.size, f.name, f.photo),
+                *(f.lens.distortion, _mask(f, masks), f.kind, f.lens.photo),
+            )
+            for f in frames
         )
+        return Cameras.from_lists(*map(list, zip(*rows, strict=True)))
     except InputError as error:
         raise error.at(path=path) from error
     except OverflowError as error:

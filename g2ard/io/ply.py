@@ -1,7 +1,7 @@
 """Reader and writer for standard 3DGS .ply files, in the layout of INRIA's trainer."""
 
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +14,7 @@ from g2ard.io.packing import rounding
 from g2ard.io.sanitize import BLOCK, LOG_SCALE_LIMIT, Raw
 from g2ard.io.stream import RawStream, SceneStream
 from g2ard.io.types import Float, Float32, Note, Values
-from g2ard.progress import plural
+from g2ard.progress import plural, some
 from g2ard.scene.splats import SH_C0, Splats, far_middle, unit_quats
 from g2ard.scene.transform import as_stored, stand_as
 
@@ -105,7 +105,7 @@ class Stream(RawStream):
                     self._decode(block[part], raw.take(part))
             yield raw
 
-    def _columns(self, block: Values, names: list[str]) -> Values:
+    def _columns(self, block: Values, names: Sequence[str]) -> Values:
         return structured_to_unstructured(block[[self._names[name] for name in names]])
 
     def _means(self, block: Values) -> Float32:
@@ -184,8 +184,8 @@ def _frames(header: plyfiles.PlyHeader) -> list[Note]:
     moving = [name for name, rows in header.counts.items() if name not in groups and rows == count != 1]
     if not moving:
         return []
-    names = ", ".join(moving[:3]) + (", …" if len(moving) > 3 else "")
-    text = f"animated scene: frame 0 is read, {plural(len(moving), 'further element')} ({names}) ignored"
+    what = plural(len(moving), "further element")
+    text = f"animated scene: frame 0 is read, {what} ({some(moving)}) ignored"
     return [Note("ignored_frames", len(moving), text)]
 
 
@@ -201,8 +201,7 @@ def _ignored(unused: list[str], rest: list[str], stored: int, kept: int) -> list
     extra = [name for name in unused if name not in known]
     notes = []
     if extra:
-        names = ", ".join(extra[:4]) + (", …" if len(extra) > 4 else "")
-        text = f"{plural(len(extra), 'extra property', 'extra properties')} ignored ({names})"
+        text = f"{plural(len(extra), 'extra property', 'extra properties')} ignored ({some(extra, 4)})"
         notes.append(Note("ignored_properties", len(extra), text))
     if stored > kept:
         notes.append(Note("ignored_bands", 1, "spherical harmonics past degree 3 ignored"))

@@ -14,7 +14,7 @@ from plyfile import PlyData, PlyElement, PlyElementParseError, PlyListProperty, 
 from g2ard.config.choices import AXES, Axes, RenderModel
 from g2ard.errors import InputError, damaged
 from g2ard.io.atomic import atomic_output
-from g2ard.io.paths import plain_numbers
+from g2ard.io.paths import about, plain_numbers
 from g2ard.io.signs import AGAIN
 from g2ard.io.types import Float, Values
 from g2ard.scene.splats import Splats
@@ -32,8 +32,8 @@ _RENDER_MODES: dict[str, RenderModel | Literal["2dgs"]] = {
 """Comments of brush and Postshot, in lower case."""
 
 COLOR_NAMES = [
-    [f"{prefix}{name}" for name in names]
-    for names in (["red", "green", "blue"], ["r", "g", "b"], ["rf", "gf", "bf"])
+    tuple(f"{prefix}{name}" for name in names)
+    for names in (("red", "green", "blue"), "rgb", ("rf", "gf", "bf"))
     for prefix in ("", "diffuse_", "color_", "vertex_")
 ]
 """Names of colours."""
@@ -65,11 +65,8 @@ class PlyHeader:
 
 
 def read_header(path: Path) -> PlyHeader:
-    try:
-        with path.open("rb") as file:
-            head = file.read(_HEADER_LIMIT)
-    except OSError as error:
-        raise InputError(f"{error.strerror}", path=path) from error
+    with about(path), path.open("rb") as file:
+        head = file.read(_HEADER_LIMIT)
     if not head:
         raise InputError("is empty", path=path)
     start = len(_MARK) if head.startswith(_MARK) else 0

@@ -10,7 +10,7 @@ from g2ard.io.finding import Finder, files_in
 from g2ard.io.jsonfile import Number, Place, Whole, checked, read_json
 from g2ard.io.photos import Frame, Lens, Listed, rigid
 from g2ard.io.transforms import opencv_view
-from g2ard.io.types import Note, ViewFiles
+from g2ard.io.types import ViewFiles
 
 _FOLDERS = (("corrected_cameras", "corrected_images"), ("cameras", "images"))
 """Folders of cameras and photos: after Polycam's optimisation, and as ARKit tracked them."""
@@ -47,11 +47,9 @@ def read(views: ViewFiles) -> Listed:
     cameras, photos = folders
     files = sorted(files_in(cameras, ".json"), key=lambda file: (len(file.stem), file.stem))
     finder = Finder(images or photos)
-    found = Listed(path, [_frame(file, finder) for file in files])
-    if cameras.name == "corrected_cameras":
-        return found
     text = "the capture has no corrected_cameras; these are ARKit's poses as tracked"
-    return found._replace(notes=(Note("tracked_poses", len(files), text),))
+    tracked = 0 if cameras.name == "corrected_cameras" else len(files)
+    return Listed(path, [_frame(file, finder) for file in files]).noted("tracked_poses", tracked, text)
 
 
 def _frame(file: Path, finder: Finder) -> Frame:

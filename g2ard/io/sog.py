@@ -239,21 +239,23 @@ def _logits(place: Place, part: _Part) -> Values:
     """Return the (256,) logits of opacity bytes, which are α in version 2 and logits in version 1."""
     alpha = np.arange(256) / 255
     if part.codebook is UNSET:
-        low, high = (_bound(place.to(name), getattr(part, name), slice(3, 4)) for name in ("mins", "maxs"))
+        low, high = _ends(place, part, slice(3, 4))
         return low + (high - low) * alpha
     return logits_of(alpha)
 
 
-def _bound(place: Place, bound: _Bound | None, channels: slice) -> Values:
-    if bound is None or (isinstance(bound, list) and len(bound) < channels.stop):
-        raise (place if bound is None else place.to(3)).error("is missing")
-    return np.asarray(bound[channels] if isinstance(bound, list) else bound)
+def _ends(place: Place, part: _Part, channels: slice) -> Iterator[Values]:
+    """Yield the lower and the upper bounds of channels."""
+    for name, bound in (("mins", part.mins), ("maxs", part.maxs)):
+        if bound is None or (isinstance(bound, list) and len(bound) < channels.stop):
+            raise place.to(name, *([] if bound is None else [3])).error("is missing")
+        yield np.asarray(bound[channels] if isinstance(bound, list) else bound)
 
 
 def _values(place: Place, part: _Part) -> Callable[[Bytes], Values]:
     """Return the values of bytes: from a codebook (version 2), or between mins and maxs (version 1)."""
     if part.codebook is UNSET:
-        low, high = (_bound(place.to(name), getattr(part, name), slice(3)) for name in ("mins", "maxs"))
+        low, high = _ends(place, part, slice(3))
         return lambda codes: low + (high - low) * (codes / 255)
     place, book = place.to("codebook"), np.array(part.codebook, np.float64)
     wrong = np.isfinite(book) & (np.abs(book) > _LARGEST_FLOAT32)

@@ -9,7 +9,7 @@ import numpy as np
 from g2ard.errors import InputError, damaged
 from g2ard.io.atomic import atomic_output
 from g2ard.io.packing import FAR_FROM_ORIGIN, as_bytes, as_packed
-from g2ard.io.plyfiles import spread_rows
+from g2ard.io.plyfiles import row_blocks, spread_rows
 from g2ard.io.sanitize import Raw
 from g2ard.io.stream import RawStream
 from g2ard.scene.splats import SH_C0, Splats, unit_quats
@@ -42,10 +42,7 @@ class Stream(RawStream):
         super().__init__(path, size // _ROW.itemsize)
 
     def raw(self, rows: int, start: int) -> Iterator[Raw]:
-        for first in range(start, self.count, rows):
-            block = np.fromfile(self.path, _ROW, rows, offset=first * _ROW.itemsize)
-            if len(block) < min(rows, self.count - first):
-                raise InputError("was truncated while it was read", path=self.path)
+        for _, block in row_blocks(self.path, np.memmap(self.path, _ROW, "r"), rows, start):
             raw = Raw.empty(len(block), 0)
             raw.means[:] = block["mean"]
             raw.set_linear(block["scale"], block["rgba"][:, 3] / 255)

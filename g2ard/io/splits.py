@@ -107,13 +107,13 @@ def _masks(views: str | Path | None, names: Sequence[str], stated: Sequence[str 
         if (mask := _listed(names, wanted)).any():
             return {split: mask, "test" if split == "train" else "train": ~mask}
     if listed is None:
-        test = np.zeros(len(names), bool)
         photos = [photo_of(name) for name in names]
         held = set(sorted(set(photos))[::HOLD_OUT])
-        test[:] = [photo in held for photo in photos]
+        test = np.array([photo in held for photo in photos], bool)
         return {"train": ~test, "test": test}
     masks = {word: _listed(names, wanted) for word, wanted in listed.items()}
-    both = masks["train"] & masks["test"] if {"train", "test"} <= set(masks) else np.zeros(len(names), bool)
+    none = np.zeros(len(names), bool)
+    both = masks.get("train", none) & masks.get("test", none)
     if both.any():
         raise InputError(
             f"split.json lists {names[int(np.argmax(both))]!r} as both train and test", path=views

@@ -27,7 +27,7 @@ from g2ard.io.jsonfile import Vector, checked, parse_json
 from g2ard.io.paths import about, check_unpacked
 from g2ard.io.sanitize import Raw, cleaned, logits_of
 from g2ard.io.types import Bytes, Float, Note, Noted, Values
-from g2ard.progress import Progress, plural, silent
+from g2ard.progress import Progress, plural, silent, some
 from g2ard.scene.splats import Splats
 from g2ard.scene.transform import change_of_axes, harmonic_signs, moved_axes, restored, with_axes
 
@@ -401,10 +401,9 @@ def fraction_bits(path: Path, means: Float, splats: Splats, *, movable: bool = F
         )
     near = np.delete(splats.means, far, axis=0).astype(np.float64) + splats.offset
     ends = [*np.floor(near.min(axis=0)), *np.ceil(near.max(axis=0))]
-    first = ", ".join(map(str, far[:3].tolist())) + (", …" if len(far) > 3 else "")
     raise InputError(
         f".spz is too coarse at {farthest:g} from the origin {steps}, where {plural(len(far), 'Gaussian')} "
-        f"of {len(means):,} lie (row {first})",
+        f"of {len(means):,} lie (row {some(far.tolist())})",
         path=path,
         hint=f"crop the scene with `g2ard convert --box={','.join(f'{v:.0f}' for v in ends)}`, or write "
         "another format",

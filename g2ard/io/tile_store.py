@@ -21,6 +21,7 @@ from g2ard.config.choices import Axes, RenderModel
 from g2ard.errors import InputError
 from g2ard.io.detect import MANIFEST
 from g2ard.io.jsonfile import Number, Place, Vector, Whole, checked, read_own
+from g2ard.io.paths import about
 from g2ard.io.sanitize import Raw
 from g2ard.io.stream import PartsStream
 from g2ard.io.types import Float, Float32, Notes
@@ -160,10 +161,8 @@ class TileStore:
     def _check_size(self, name: str, rows: int) -> None:
         path = self.folder / name
         expected = self.row_bytes * rows
-        try:
+        with about(path):
             size = path.stat().st_size
-        except OSError as error:
-            raise InputError(f"{error.strerror}", path=path) from error
         if size != expected:
             raise InputError(f"{size:,} bytes, but the manifest says {expected:,}", path=path)
 

@@ -85,13 +85,12 @@ def read(views: ViewFiles) -> Listed:
     path = views.path
     if path.name != _TRAIN:
         return listed(views)
-    test, note = path.parent / _TEST, Note("test_beside", 1, f"{_TEST} beside it has the test views")
+    test = path.parent / _TEST
     if test.is_file():
         found = _listed(path, {path: "train", test: "test"}, views.images)
-        return found._replace(notes=(*found.notes, note))
-    note = Note("no_test_beside", 1, f"no {_TEST} beside it; every 8th of its views is held out")
-    found = listed(views)
-    return found._replace(notes=(*found.notes, note))
+        return found.noted("test_beside", 1, f"{_TEST} beside it has the test views")
+    text = f"no {_TEST} beside it; every 8th of its views is held out"
+    return listed(views).noted("no_test_beside", 1, text)
 
 
 def listed(views: ViewFiles) -> Listed:

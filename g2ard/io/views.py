@@ -13,6 +13,7 @@ from g2ard.config.choices import ViewFormat
 from g2ard.errors import InputError, OutputError
 from g2ard.io.atomic import atomic_folder, atomic_output, check_output
 from g2ard.io.detect import file_format, reader, run_views
+from g2ard.io.paths import about
 from g2ard.io.signs import explained
 from g2ard.progress import plural
 
@@ -133,10 +134,8 @@ def read_view_set(
     module = reader(path, file_format(path), "views")
     if given.images is not None and not given.images.is_dir():
         raise InputError("no such folder of photos", path=given.images)
-    try:
+    with about(path):  # also for an invalid name of a photo, or a folder that cannot be read
         views = view_set(module.read(replace(given, path=path)))
-    except OSError as error:  # invalid photo name, unreadable folder
-        raise InputError(error.strerror or str(error), path=path) from error
     views = views if unpictured else pictured(views)
     views = alpha_as_masks(views) if given.alpha == "mask" else views
     return views.take(split_mask(path, views.cameras.names, split, stated=views.splits))
