@@ -10,6 +10,11 @@ Colour = tuple[float, float, float]
 BLACK: Colour = (0.0, 0.0, 0.0)
 """Default background colour."""
 
+LengthUnit = Literal["m", "ft", "us-ft"]
+"""Units of scenes on a globe."""
+UNITS: dict[LengthUnit, float] = {"m": 1.0, "ft": 0.3048, "us-ft": 1200 / 3937}
+"""Unit → its metres."""
+
 Method = Literal["default", "fast", "paper"]
 """Methods of simplification."""
 METHODS: tuple[Method, ...] = get_args(Method)

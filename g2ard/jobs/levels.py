@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g2ard.config.checks import AtLeastOne, checks_arguments
-from g2ard.config.choices import BLACK, Colour, RenderModel
+from g2ard.config.choices import BLACK, UNITS, Colour, LengthUnit, RenderModel
 from g2ard.errors import InputError
 from g2ard.io import Source
 from g2ard.io.labels import names_of
@@ -28,7 +28,7 @@ from g2ard.jobs.distill import DistillJob, preparing
 from g2ard.jobs.distill_options import DistillOptions
 from g2ard.jobs.inputs import GivenViews, Views, load_scene
 from g2ard.jobs.viewer_frame import backdrop, frame_of, up_of
-from g2ard.levels.tileset import TILE_OF_SCENE, Georeference, map_system
+from g2ard.levels.tileset import TILE_OF_SCENE, Georeference, is_outside, map_system, metres_of
 from g2ard.levels.tileset import save_tileset as write_tileset
 from g2ard.levels.tree import Cut, Level, aligned
 from g2ard.pipeline.dense import Dense
@@ -300,6 +300,7 @@ def save_tileset(
     *,
     up: Sequence[float] | None = None,
     place: Georeference | str | None = None,
+    unit: LengthUnit | None = None,
     cut: Cut | None = None,
     overwrite: bool = False,
     work: Path | None = None,
@@ -313,10 +314,11 @@ def save_tileset(
 
     Args:
         path: the output folder, for `tileset.json` and `LEVEL_N.glb`.
-        levels: the same scene at several levels, finest first, with equal offsets, in metres.
+        levels: the same scene at several levels, finest first, with equal offsets.
         up: (3,) direction away from the ground; None means z for map coordinates, otherwise an estimate.
         place: where the scene's `offset` lies on the globe, or the name of the map system of its coordinates,
             such as "EPSG:32635". None leaves it at the tileset's origin, z up.
+        unit: unit of the scene: m, ft or us-ft; None means that of a map system, otherwise the metre.
         cut: splitting rule of the tree, and the most Gaussians of a tile; None means `Cut()`.
         overwrite: replace files in the folder, and remove files of its previous `tileset.json`.
         work: folder for temporary files, which saves memory.
@@ -342,14 +344,24 @@ def save_tileset(
     """
     told = say or unsaid
     near, *_ = aligned(levels)
+    metres = UNITS[unit or "m"]
     if isinstance(place, str):
-        place = Georeference.of_map(map_system(place), near[0].offset)
+        system = map_system(place)
+        metres = metres_of(system)
+        place, name = Georeference.of_map(system, near[0].offset), place
         told(f"longitude {place.longitude:.6f}, latitude {place.latitude:.6f}, heading {place.heading:.3f}")
+        if is_outside(system, place):
+            told(
+                f"warning: the scene lies outside the area of {name}; is it in that map system and its unit?"
+            )
+    elif place is not None:
+        told(_extent_line(near[-1], metres, known=unit is not None))
     size, notes = write_tileset(
         path,
         levels,
         axis=tileset_up(near, None, told) if up is None else up,
         place=place,
+        unit=metres,
         cut=cut,
         overwrite=overwrite,
         work=work,
@@ -357,6 +369,21 @@ def save_tileset(
     )
     tell(path, notes, say)
     return size
+
+
+def _extent_line(coarsest: Level, metres: float, *, known: bool) -> str:
+    """Describe the extent of a scene, and warn if it is improbable."""
+    rows = np.array(evenly_spaced(len(coarsest), _UP_SAMPLE, floor=True))
+    low, high = np.percentile(coarsest.take(rows).means, (1, 99), axis=0)
+    across = metres * float((high - low).max())
+    text = f"the scene is {across:,.3g} m across" if across < 1000 else f"the scene is {across:,.0f} m across"
+    if not known:
+        text += ", if its unit is the metre; --unit ft otherwise"
+    return text if _PROBABLE[0] < across < _PROBABLE[1] else f"warning: {text}"
+
+
+_PROBABLE = 0.1, 20_000.0
+"""Least and largest probable extent of a scene on a globe, metres."""
 
 
 def tileset_up(

@@ -65,11 +65,13 @@ class Georeference(Settings):
     def of_map(cls, system: Any, offset: ArrayLike) -> Georeference:
         """Return the place of an offset in map coordinates, with the direction of grid north as heading.
 
-        The offset is easting, northing and height in metres of a system of `map_system`.
+        The offset is easting, northing and height in the unit of a system of `map_system`.
         """
         import pyproj
 
         east, north, height = np.asarray(offset, np.float64).tolist()
+        if len(system.axis_info) == 2:  # heights of such a system are metres to pyproj
+            height *= metres_of(system)
         to_globe = pyproj.Transformer.from_crs(system, "EPSG:4979", always_xy=True)
         lon, lat, up = to_globe.transform(east, north, height)
         ahead = to_globe.transform(east, north + 100, height)
@@ -93,7 +95,7 @@ class Georeference(Settings):
 
 
 def map_system(name: str) -> Any:
-    """Return pyproj's coordinate system of a name such as EPSG:32635, projected and in metres."""
+    """Return pyproj's coordinate system of a name such as EPSG:32635, projected and of one unit."""
     try:
         import pyproj
     except ImportError as error:
@@ -104,13 +106,27 @@ def map_system(name: str) -> Any:
         raise InputError(
             f"unknown coordinate system {name!r}; expected EPSG:CODE", parameter="place"
         ) from None
-    if not system.is_projected or any(axis.unit_conversion_factor != 1 for axis in system.axis_info):
+    if not system.is_projected or len({axis.unit_conversion_factor for axis in system.axis_info}) > 1:
         raise InputError(
-            f"{system.name} is not a projected system in metres",
+            f"{system.name} is not a projected system of one unit",
             parameter="place",
-            hint="scale the scene to metres with `g2ard convert --transform`, or give LON,LAT,HEIGHT",
+            hint="give another EPSG:CODE, or LON,LAT,HEIGHT",
         )
     return system
+
+
+def metres_of(system: Any) -> float:
+    """Return the metres of the unit of a system of `map_system`."""
+    return float(system.axis_info[0].unit_conversion_factor)
+
+
+def is_outside(system: Any, place: Georeference) -> bool:
+    """Return whether a place lies outside the area that a system of `map_system` is made for."""
+    area = system.area_of_use
+    if area is None:
+        return False
+    across = (place.longitude - area.west) % 360 <= (area.east - area.west) % 360
+    return not (across and area.south <= place.latitude <= area.north)
 
 
 def save_tileset(
@@ -119,6 +135,7 @@ def save_tileset(
     *,
     axis: ArrayLike,
     place: Georeference | None = None,
+    unit: float = 1.0,
     cut: Cut | None = None,
     overwrite: bool = False,
     work: Path | None = None,
@@ -135,7 +152,7 @@ def save_tileset(
     root = parts[0] if len(parts) == 1 else _tile(tree, size, parts)
     matrix = np.eye(4) if place is None else place.matrix()
     turn = np.eye(4)
-    turn[:3, :3] = _upright(axis) @ TILE_OF_SCENE.T
+    turn[:3, :3] = unit * _upright(axis) @ TILE_OF_SCENE.T
     root["transform"] = (matrix @ turn).T.ravel().tolist()
     extensions = [EXTENSION, SPZ_EXTENSION]
     tileset = {
@@ -145,7 +162,7 @@ def save_tileset(
         "extensions": {
             "3DTILES_content_gltf": {"extensionsUsed": extensions, "extensionsRequired": extensions}
         },
-        "geometricError": max(size, root["geometricError"]),
+        "geometricError": unit * max(size, root["geometricError"]),
         "root": root,
     }
     with replaced(path, overwrite, _named_in(path / "tileset.json")) as (folder, written):

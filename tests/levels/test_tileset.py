@@ -4,6 +4,7 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import laspy
 import numpy as np
 import pytest
 
@@ -129,11 +130,58 @@ def test_a_map_system_gives_the_place_and_grid_north(tmp_path: Path) -> None:
     assert east.heading == pytest.approx(turned, abs=2e-3)
     for name, message in (
         ("EPSG:4326", "not a projected"),
-        ("EPSG:2994", "not a projected"),
         ("X", "unknown"),
     ):
         with pytest.raises(InputError, match=message):
             map_system(name)
+
+
+def test_a_map_system_in_feet_gives_metres(tmp_path: Path) -> None:
+    pyproj = pytest.importorskip("pyproj")
+    offset = np.array((637_000.0, 851_000.0, 400.0))  # Autzen, Oregon
+    scene = Splats.create([(0, 0, 0), (1000, 0, 0)], scales=np.full((2, 3), 5), offset=offset)
+    told: list[str] = []
+    save_tileset(tmp_path, [scene], up=(0, 0, 1), place="EPSG:2994", say=told.append)
+    assert not any("warning" in line for line in told)
+    matrix = (
+        np.array(json.loads((tmp_path / "tileset.json").read_text())["root"]["transform"]).reshape(4, 4).T
+    )
+    lon, lat = pyproj.Transformer.from_crs("EPSG:2994", "EPSG:4326", always_xy=True).transform(*offset[:2])
+    np.testing.assert_allclose(matrix[:3, 3], geocentric(lon, lat, 400 * 0.3048), atol=1e-3)
+    np.testing.assert_allclose(np.linalg.norm(matrix[:3, 0]), 0.3048)
+    save_tileset(tmp_path, [scene], up=(0, 0, 1), place="EPSG:3301", overwrite=True, say=told.append)
+    assert "warning: the scene lies outside the area of EPSG:3301" in "\n".join(told)
+
+
+@pytest.mark.parametrize(("unit", "metres"), [("", 1), ("--unit ft", 0.3048), ("--unit us-ft", 1200 / 3937)])
+def test_the_unit_scales_the_tiles(
+    unit: str, metres: float, tmp_path: Path, command_line: CommandLine
+) -> None:
+    write_splats(tmp_path / "a.ply", checkered_ball(400))
+    words = ["lod", "a.ply", "-r", "1", "--merge-only", "--size", "48", "--format", "3dtiles", "-o", "out"]
+    error = succeeds(command_line, tmp_path, *words, "--georeference", "0,0,0", *unit.split()).err
+    assert ("if its unit is the metre; --unit ft otherwise" in error) == (not unit)
+    assert "m across" in error
+    tileset = json.loads((tmp_path / "out" / "tileset.json").read_text())
+    matrix = np.array(tileset["root"]["transform"]).reshape(4, 4).T
+    np.testing.assert_allclose(np.linalg.norm(matrix[:3, :3], axis=0), metres)
+    assert tileset["geometricError"] == pytest.approx(metres * 2 * 3**0.5, rel=0.3)
+    assert "--unit needs" in refused(command_line, tmp_path, *words[:-1], "b", "--unit", "ft")
+
+
+def test_the_unit_of_a_scan_is_used(tmp_path: Path, command_line: CommandLine) -> None:
+    header = laspy.LasHeader(point_format=7, version="1.4")
+    header.scales = np.full(3, 1e-3)
+    header.vlrs.append(laspy.vlrs.known.WktCoordinateSystemVlr('PROJCS["Oregon",UNIT["foot",0.3048]]'))
+    scan = laspy.LasData(header)
+    scan.x, scan.y, scan.z = checkered_ball(400).means.T
+    scan.red = scan.green = scan.blue = np.arange(400) * 99
+    scan.write(str(tmp_path / "a.las"))
+    ask = ("lod", "a.las", "-r", "1", "--merge-only", "--tile-rows", 200, "--format", "3dtiles", "-o", "out")
+    error = succeeds(command_line, tmp_path, *ask, "--georeference", "0,0,0").err
+    assert "if its unit" not in error
+    matrix = json.loads((tmp_path / "out" / "tileset.json").read_text())["root"]["transform"]
+    np.testing.assert_allclose(np.linalg.norm(matrix[:3]), 0.3048)
 
 
 def test_the_command_writes_3d_tiles(tmp_path: Path, command_line: CommandLine) -> None:

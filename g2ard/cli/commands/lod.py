@@ -16,7 +16,7 @@ from g2ard.cli.command import command
 from g2ard.cli.outputs import refuse_file
 from g2ard.cli.run import Run
 from g2ard.cli.work_folder import tiling_of, work_folder
-from g2ard.config.choices import BLACK
+from g2ard.config.choices import BLACK, UNITS, LengthUnit
 from g2ard.io.atomic import hidden_name
 from g2ard.progress import plural
 
@@ -103,6 +103,10 @@ def lod(
             "heading of its y axis (z if -y is up), degrees from north; or its coordinates' map system.",
         ),
     ] = None,
+    unit: Annotated[
+        LengthUnit | None,
+        typer.Option(help="Unit of the scene with --georeference; by default the scan's or map system's."),
+    ] = None,
     views: opt.ViewsOrMadeOption = None,
     images: opt.ImagesOption = None,
     steps: Annotated[
@@ -156,6 +160,8 @@ def lod(
     tiled = is_tiled(source, tiling)
     if spot is not None and kind == "sog":
         raise typer.BadParameter("--georeference needs --format 3dtiles")
+    if unit is not None and (spot is None or isinstance(spot, str)):
+        raise typer.BadParameter("--unit needs --georeference LON,LAT,HEIGHT")
     if environment and kind != "sog":
         raise typer.BadParameter("--environment needs --format sog")
     if environment and tiled:
@@ -215,7 +221,9 @@ def lod(
             written = save_levels(output, levels.splats, environment=levels.sky, **common)
         else:
             axis = tileset_up(levels.splats, up, run.say).tolist()
-            written = save_tileset(output, levels.splats, up=axis, place=spot, **common)
+            stated = source.metres_per_unit or 0.0
+            unit = unit or next((name for name, metres in UNITS.items() if abs(metres - stated) < 1e-7), None)
+            written = save_tileset(output, levels.splats, up=axis, place=spot, unit=unit, **common)
         run.kept.append(f"{output} is written")
         frame = GivenViews(views, scene, axis)
         with run.showing("the page"):
