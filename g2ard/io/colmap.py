@@ -118,6 +118,15 @@ def points_file(path: Path) -> Path | None:
     return next((held[name] for name in _POINT_FILES if name in held), folder / "points3D.bin")
 
 
+def numbers_of(folder: Path, names: Sequence[str]) -> set[int]:
+    """Return the numbers by which points name some images of the model in a folder."""
+    tables, wanted = _tables(folder), set(names)
+    if tables is None:
+        return set()
+    with parsing(tables[1]):
+        return {key for name, key, *_ in _images(open_table(tables[1], "image")) if name in wanted}
+
+
 _POINT_FILES = ("points3d.bin", "points3d.txt")
 
 
@@ -304,11 +313,12 @@ class Table:
     def skip_points(self) -> None:
         self.skip(24 * self.take(_POINTS)[0], "POINTS2D")
 
-    def skip(self, size: int, name: str) -> None:
-        """Move past the bytes of a column."""
-        self._at += size
+    def skip(self, size: int, name: str) -> bytes:
+        """Move past the bytes of a column, and return them."""
+        start, self._at = self._at, self._at + size
         if self._at > len(self.data):
             raise self._cut_off(name)
+        return self.data[start : self._at]
 
     def place(self, name: str) -> Place:
         return Place(self.path, self.row, self.item, name)

@@ -28,7 +28,7 @@ from g2ard.jobs.doubts import doubts_of_regions, doubts_of_views
 from g2ard.jobs.inputs import GivenViews, Views, axes_of, load_scene, make_targets, scorable, split_views
 from g2ard.jobs.memory import RECOVERY_TIMES, TilePlan
 from g2ard.jobs.photo_colors import colored
-from g2ard.jobs.photo_points import distinct, sparse_file, sparse_points, topped_up, usual_count
+from g2ard.jobs.photo_points import distinct, placed_by, sparse_file, sparse_points, topped_up, usual_count
 from g2ard.jobs.run_views import Use, pool_times, views_of, within_pixels
 from g2ard.jobs.simplify import Reduction
 from g2ard.jobs.view_checks import check_photos, propose_background
@@ -793,10 +793,10 @@ def _read(
         axes = axes_of(cloud, name, say, progress)
         lifted = lift(xyz, rgb, axes=axes, **vars(options.config.lift), progress=progress)
         return _Read(InMemory(lifted), True, False, options.beside, name, len(lifted))
-    cloud, name, of_photos = _points(scene, views, say)
-    points: Points | None = None
     parts = split_views(views, options.held_out, say)
     train = parts[0].cameras
+    cloud, name, of_photos = _points(scene, views, say, train)
+    points: Points | None = None
     if cloud is not None:
         points = distinct(colored(cloud, train, name, progress=progress, say=say))
     given = 0 if points is None or scene is None else len(points)
@@ -846,18 +846,24 @@ def _in_tiles(scene: Given, options: DistillOptions, tiles: Opened, say: Say) ->
     )
 
 
-def _points(scene: Points | Source | None, views: Views | None, say: Say) -> tuple[Cloud | None, str, bool]:
+def _points(
+    scene: Points | Source | None, views: Views | None, say: Say, train: Cameras | None = None
+) -> tuple[Cloud | None, str, bool]:
     """Return a cloud, or that stored with the views, its name in errors, and whether it was found in photos.
 
-    With views, the cloud may be without colours.
+    With views, the cloud may be without colours, and points found in photos are those of training views.
     """
     if isinstance(scene, Points):
         return Cloud(scene, (), np.any(scene.colors, axis=1)), "cloud", False
     sparse = None if views is None else sparse_file(views)
     if scene is None:
-        return sparse_points(sparse, say), "cloud" if sparse is None else str(sparse), True
-    cloud = scene.cloud(bare=views is not None).whole()
+        return sparse_points(sparse, say, train), "cloud" if sparse is None else str(sparse), True
+    given = (scene.kind == "views" and sparse_file(scene.path)) or scene.path
+    of_photos = sparse is not None and real_path(given) == real_path(sparse)
+    if sparse is not None and of_photos and train is not None:
+        cloud = placed_by(train, sparse)
+    else:
+        cloud = scene.cloud(bare=views is not None).whole()
     for note in cloud.notes:
         say(f"{scene}: {note}")
-    given = (scene.kind == "views" and sparse_file(scene.path)) or scene.path
-    return cloud, str(scene), sparse is not None and real_path(given) == real_path(sparse)
+    return cloud, str(scene), of_photos

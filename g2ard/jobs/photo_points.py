@@ -238,14 +238,28 @@ def distinct(points: Points) -> Points:
     return Points(points.positions[rows], np.ascontiguousarray(colors, np.float32))
 
 
-def sparse_points(file: Path | None, say: Say = unsaid) -> Cloud | None:
-    """Read the points of `sparse_file`; return None, and say why, if no point is readable."""
+def placed_by(train: Cameras, file: Path) -> Cloud:
+    """Read the points of `sparse_file` that training views see, as far as the file states who does."""
+    if file.stem.lower() != "points3d":
+        return read_cloud(file, bare=True)
+    from g2ard.io import points3d
+
+    return points3d.Stream(file, train.names).whole()
+
+
+def sparse_points(file: Path | None, say: Say = unsaid, train: Cameras | None = None) -> Cloud | None:
+    """Read the points of `sparse_file`; return None, and say why, if no point is readable.
+
+    With training views, points that these do not see are skipped.
+    """
     try:
-        cloud = None if file is None else read_cloud(file, bare=True)
+        if file is None:
+            return None
+        cloud = read_cloud(file, bare=True) if train is None else placed_by(train, file)
     except G2ardError as error:
         say(f"warning: no starting points from photos: {error}")
         return None
-    if cloud is None or len(cloud.points):
+    if len(cloud.points):
         return cloud
     say(f"warning: no starting points from photos: {file}: has no points")
     return None

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+import struct
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
@@ -12,6 +13,7 @@ import pytest
 
 import g2ard
 from g2ard.io import write_views
+from g2ard.io.colmap import texts_of
 from g2ard.io.images import write_png
 from g2ard.io.types import Points
 from helpers.photos import photographed
@@ -163,3 +165,65 @@ def test_training_photos_change_the_result(name: str, tmp_path: Path) -> None:
         shutil.rmtree(tmp_path)
         (tmp_path / "photos").mkdir(parents=True)
     assert len(found[0]) != len(found[1]) or np.any(found[0].sh0 != found[1].sh0)
+
+
+def _model(folder: Path, suffix: str, moved: bool) -> Path:
+    """Write a COLMAP model of the ball, whose points each state 1 to 5 images; return their file.
+
+    Args:
+        moved: move and repaint the points that fewer than two training photos see.
+    """
+    folder.mkdir(parents=True)
+    views = replace(VIEWS, names=tuple(f"{name}.png" for name in VIEWS.names))
+    (folder / "images").mkdir()
+    photographed(folder / "images", BALL, VIEWS)
+    (folder / "sparse" / "0").mkdir(parents=True)
+    for name, text in texts_of(views).items():
+        (folder / name).write_text(text)
+    rng = np.random.default_rng(0)
+    train = [row for row in range(len(VIEWS)) if row not in HELD_OUT]
+    points = []
+    colours = np.rint(255 * np.clip(0.5 + 0.282 * BALL.sh0[:, 0], 0, 1)).astype(int).tolist()
+    for xyz, rgb in zip(BALL.means.astype(float), colours, strict=True):
+        track = rng.choice(len(VIEWS), int(rng.integers(6)), replace=False)
+        if moved and len(track) and np.isin(track, train).sum() < 2:
+            xyz, rgb = xyz * 1.7, [255, 0, 0]
+        points.append((xyz, rgb, (track + 1).tolist()))
+    file = folder / "sparse" / "0" / f"points3D{suffix}"
+    (folder / "sparse" / "0" / "points3D.txt").unlink(missing_ok=True)
+    if suffix == ".bin":
+        data = struct.pack("<Q", len(points))
+        for number, (xyz, rgb, track) in enumerate(points):
+            data += struct.pack("<Q3d3BdQ", number, *xyz, *rgb, 0.5, len(track))
+            data += b"".join(struct.pack("<II", image, 0) for image in track)
+        file.write_bytes(data)
+    else:
+        lines = [
+            " ".join(map(str, [number, *map(float, xyz), *rgb, 0.5, *(f"{image} 0" for image in track)]))
+            for number, (xyz, rgb, track) in enumerate(points)
+        ]
+        file.write_text("\n".join(lines))
+    return file
+
+
+@pytest.mark.parametrize("suffix", [".bin", ".txt"])
+@pytest.mark.parametrize("given", [False, True], ids=["photos alone", "points given"])
+@pytest.mark.parametrize("split", ["stated", "given"])
+def test_points_that_held_out_photos_found_change_no_bit(
+    split: str, given: bool, suffix: str, tmp_path: Path
+) -> None:
+    """Points of COLMAP that fewer than two training photos see start nothing."""
+    found = []
+    for moved in (False, True):
+        folder = tmp_path / f"{moved}"
+        points, held_out = _model(folder, suffix, moved), None
+        if split == "stated":
+            (points.parent / "test.txt").write_text("\n".join(f"{name}.png" for name in names_of(HELD_OUT)))
+        else:
+            held_out = folder / "scores.json"
+            views = g2ard.load_views(folder)
+            names = {f"{name}.png" for name in names_of(HELD_OUT)}
+            write_views(held_out, views.take([name in names for name in views.names]))
+        done = g2ard.distill(points if given else None, views=folder, held_out=held_out, count=90, steps=3)
+        found.append(done.splats)
+    assert_same_bits(*found)
