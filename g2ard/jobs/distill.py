@@ -29,7 +29,7 @@ from g2ard.jobs.inputs import GivenViews, Views, axes_of, load_scene, make_targe
 from g2ard.jobs.memory import RECOVERY_TIMES, TilePlan
 from g2ard.jobs.photo_colors import colored
 from g2ard.jobs.photo_points import distinct, placed_by, sparse_file, sparse_points, topped_up, usual_count
-from g2ard.jobs.run_views import Use, pool_times, views_of, within_pixels
+from g2ard.jobs.run_views import Use, is_untouched, pool_times, views_of, within_pixels
 from g2ard.jobs.simplify import Reduction
 from g2ard.jobs.view_checks import check_photos, propose_background
 from g2ard.jobs.viewer_frame import best_level
@@ -145,13 +145,8 @@ class DistillJob:
 
     def is_kept(self, count: int) -> bool:
         """Return whether the scene already is the result: it fits, and its renders are the targets."""
-        degree = self.config.recover.sh_degree
-        return (
-            not self.reads_photos
-            and count == self.total
-            and (degree is None or degree >= self.prior.sh_degree)
-            and self.config.recover.schedule.guarded
-        )
+        untouched = is_untouched(self.config.recover, self.prior, count, self.total)
+        return not self.reads_photos and untouched
 
     def steps(self, count: int) -> int:
         """Return the steps of all recoveries: after each round, if there are rounds, and of the last."""

@@ -132,7 +132,12 @@ def views_of(
             planned,
             held_out,
             options.size,
-            partial(mix, select=select, share=share),
+            partial(
+                mix,
+                select=select,
+                share=share,
+                learns=not is_untouched(options.config.recover, prior, count, round(represents * len(prior))),
+            ),
             use,
             say,
             share=share,
@@ -159,6 +164,12 @@ def views_of(
     weigh = partial(draw_weights, prior, train, options.config, progress)
     train, apart, _ = mix(train, planned, select=select, weigh=weigh, zoom=False)
     return RunViews(train, test, apart, full=full)
+
+
+def is_untouched(recover: RecoverConfig, prior: Splats, count: int, total: int) -> bool:
+    """Return whether a scene already is the result if its renders are the targets."""
+    degree = recover.sh_degree
+    return count == total and (degree is None or degree >= prior.sh_degree) and recover.schedule.guarded
 
 
 def pool_share(recover: RecoverConfig, scene: Splats, pool: Cameras) -> float:
@@ -282,6 +293,7 @@ def _mixed(
     progress: Progress,
     say: Say,
     share: float = 1.0,
+    learns: bool = True,
     weigh: Callable[[], NDArray[np.float64] | None] = lambda: None,
     zoom: bool = True,
 ) -> _Mixed:
@@ -291,6 +303,7 @@ def _mixed(
 
     Args:
         share: share of the pool that is used.
+        learns: whether a scene is recovered in the views; otherwise no views are added.
         weigh: returns the weights of training views; None draws them equally often, as planned ones, which
             are not crowded. The others are drawn as often as these on average.
         zoom: whether some of the training views become zooms.
@@ -314,7 +327,7 @@ def _mixed(
         offered += cameras[:taken]
         apart += cameras[taken:]
     others = Cameras.of(apart).fitted(size) if apart else None
-    more, unseen = Cameras.of(offered) if offered else None, None
+    more, unseen = Cameras.of(offered) if offered and learns else None, None
     if focus is None and more is not None:
         compact, per_row = _compact(prior, count, represents, progress)
         order, _, unseen = complete(

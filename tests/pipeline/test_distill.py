@@ -11,6 +11,9 @@ import pytest
 import g2ard
 from g2ard.config.schema import changed
 from g2ard.io import read_splats, write_splats
+from g2ard.jobs.budget import Budget
+from g2ard.jobs.distill import prepare
+from g2ard.jobs.distill_options import DistillOptions
 from g2ard.pipeline.config import DistillConfig, SelectConfig
 from g2ard.pipeline.distill import distill
 from g2ard.rendering.targets import Targets, TeacherRenders
@@ -181,6 +184,13 @@ def test_a_scanned_cloud_and_photos_are_distilled(command_line: CommandLine, tmp
     las(tmp_path / "plain.las", PRIOR.means, None)
     error = refused(command_line, tmp_path, "lift", "plain.las", "-o", "p.ply", status=1)
     assert "has no colours ('red', 'green', 'blue'), and intensities are equal; add colours" in error
+
+
+@pytest.mark.parametrize(("ratio", "measured"), [(1.0, False), (10.0, True)])
+def test_no_coverage_is_measured_where_nothing_is_learned(ratio: float, measured: bool) -> None:
+    stages: set[str] = set()
+    prepare(PRIOR, Budget(ratio=ratio), DistillOptions(), progress=lambda stage, *_: stages.add(stage))
+    assert ("coverage" in stages) == measured
 
 
 def test_a_scene_that_fits_is_written_as_it_is(command_line: CommandLine, tmp_path: Path) -> None:
