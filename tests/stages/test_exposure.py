@@ -9,7 +9,7 @@ import pytest
 
 import g2ard
 from g2ard.pipeline.adapt import AdaptConfig, adapt
-from g2ard.rendering.exposure import exposures_of, rendered, unexposed
+from g2ard.rendering.exposure import Moments, exposures_of, rendered, unexposed
 from g2ard.rendering.targets import Exposed, Photos, PhotosOrRenders, Subset
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.samples import evenly_spaced
@@ -224,3 +224,59 @@ def test_a_target_that_a_device_may_keep_never_changes(monkeypatch: pytest.Monke
     assert recover(start(), photos(KINDS["exposure"]), RecoverConfig(steps=100)).report.exposure is not None
     assert not changing[0]
     assert changing[-1]
+
+
+@pytest.mark.parametrize("tone", [0.0, 1.0], ids=["black", "saturated"])
+def test_pixels_at_the_ends_of_the_range_tell_no_exposure(tone: float) -> None:
+    """Half of every second photo is cut off; what remains alone has its gain."""
+    targets = photos(np.where(np.arange(12) % 2, 0.7, 1.3))
+    cut = [np.array(targets[view]) for view in range(12)]
+    for image in cut[::2]:
+        image[:, ::2] = tone
+    found = exposures_of(BALL.with_sh_degree(0), Photos(VIEWS, cut), (0, 0, 0), decided=True)
+    assert found is not None
+    gains = found @ [0.3, 1.0]
+    np.testing.assert_allclose(gains[1::2].mean() / gains[::2].mean(), 0.7 / 1.3, atol=0.06)
+
+
+def test_background_beyond_a_photo_with_alpha_has_no_exposure() -> None:
+    """Where a scene shows white behind it everywhere, only its own light is dimmed."""
+    thin = replace(BALL, logit_opacities=np.full(len(BALL), -1.5, np.float32)).with_sh_degree(0)
+    gains, white = np.array([0.5, 1.0] * 6), g2ard.Renderer(thin, background=(1, 1, 1))
+    drawn, taken = [white.render(view) for view in VIEWS], []
+    for one, gain in zip(drawn, gains, strict=True):
+        alpha = one.alpha[..., None]
+        own = (one.image - (1 - alpha)) / np.maximum(alpha, 1e-3)
+        taken.append(np.concatenate([(gain * own).clip(0, 1), alpha], 2).astype(np.float32))
+    targets = Photos(VIEWS, taken, background=(1, 1, 1))
+    np.testing.assert_allclose(rendered(white, Exposed(targets), 0), targets[0], atol=0.05)
+
+
+def test_a_photo_that_is_the_negative_has_the_least_gain() -> None:
+    """So that no photo is divided by nothing, or turned over."""
+    negative = [0.9 - 0.8 * image for image in RENDERS]
+    found = exposures_of(BALL.with_sh_degree(0), Photos(VIEWS, negative), (0, 0, 0), decided=True)
+    assert found is not None
+    assert (found[..., 0] > 0).all()
+    made, _ = unexposed(Photos(VIEWS, negative), 0, found[0], (0, 0, 0))
+    assert np.isfinite(made).all()
+    fit = Moments(
+        np.tile(np.diag([1.0, 9.0]), (3, 1, 1)), np.tile([-3.0, 0.0], (3, 1)), np.ones(3), 100
+    ).fit()
+    np.testing.assert_array_equal(fit[:, 0], 0.05)
+
+
+def test_masked_and_lost_pixels_are_zero_and_transparent_ones_are_not_lost() -> None:
+    taken = [np.full((36, 48, 4), 0.4, np.float32) for _ in VIEWS]
+    taken[2][..., 3] = 1
+    taken[2][:4, :, 3] = 0  # transparent, and white behind
+    taken[2][8:12, :, :3] = 1  # saturated
+    image, mask = unexposed(
+        Photos(VIEWS, taken, background=(1, 1, 1)), 2, np.array([[2.0, 0.0]] * 3), (1, 1, 1)
+    )
+    assert mask is not None
+    assert mask[:8].all()
+    assert not mask[8:12].any()
+    assert not image[8:12].any()
+    np.testing.assert_allclose(image[:4], 1, atol=1e-6)
+    np.testing.assert_allclose(image[12:], 0.2, atol=1e-6)
