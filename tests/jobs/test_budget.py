@@ -53,6 +53,23 @@ def test_a_small_file_of_a_format_with_a_head_takes_few_trials() -> None:
     assert len(tried) <= 6
 
 
+def test_a_file_that_fills_nearly_all_bytes_ends_the_search(monkeypatch: pytest.MonkeyPatch) -> None:
+    """98 % do, 97 % do not; here every trial has the same size."""
+    for most, last in ((98.0, 1), (97.0, 6)):
+        tried: list[int] = []
+
+        def size(splats: Splats, name: str, tried: list[int] = tried, most: float = most) -> int:
+            return len(splats) if not tried else round(100 * most)
+
+        def reduce(count: int, tried: list[int] = tried) -> Splats:
+            tried.append(count)
+            return checkered_ball(count)
+
+        monkeypatch.setattr("g2ard.jobs.budget_search.file_bytes", size)
+        assert count_for_bytes(checkered_ball(40_000), 10_000, "a.sog", reduce) > 0
+        assert len(tried) == last, most
+
+
 @pytest.mark.parametrize("name", ["a.ply", "a.SOG", "a.spz", "a.compressed.ply", "x/meta.json"])
 def test_the_count_fills_the_bytes(name: str) -> None:
     scene = checkered_ball(6000)
