@@ -342,3 +342,22 @@ def test_a_grown_pool_keeps_the_kinds_of_the_first(monkeypatch: pytest.MonkeyPat
     assert asked == [16, 32]
     assert len(found.cameras) == 32
     assert found.kind == "orbit + sharp"
+
+
+def test_a_larger_pool_keeps_poses_of_kinds_that_it_would_not_use(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Poses that the larger number judges otherwise stay; the rest is evenly spread over the new ones."""
+    planned = pool_module._planned
+
+    def changing(survey: Survey, kind: str, count: int) -> tuple[Poses, list[str], str]:
+        poses, _, why = planned(survey, "orbit", count)
+        return poses, ["orbit"] if count == 12 else ["sharp"], why
+
+    scene = SCENES["statue"]()
+    alone = plan_pool(scene, 12)
+    monkeypatch.setattr(pool_module, "_planned", changing)
+    monkeypatch.setattr(pool_module, "_held", lambda *_: 0.25)
+    grown = plan_pool(scene, 12, grow=2)
+    assert len(grown.cameras) == 24
+    assert grown.kind == "orbit + sharp"
+    eyes = {tuple(eye) for eye in grown.cameras.positions.round(9).tolist()}
+    assert {tuple(eye) for eye in alone.cameras.positions.round(9).tolist()} <= eyes
