@@ -16,12 +16,12 @@ from tempfile import TemporaryDirectory
 from uuid import uuid4
 
 from g2ard.errors import OutputError
-from g2ard.io.paths import real_path
+from g2ard.io.paths import AnyPath, real_path
 
 _LONGEST_NAME = 255  # bytes of the longest file name of usual file systems
 
 
-def check_output(path: str | Path, overwrite: bool = False, *, folder: bool = False) -> Path:
+def check_output(path: AnyPath, overwrite: bool = False, *, folder: bool = False) -> Path:
     """Return `path`, or raise an `OutputError` if an output cannot be written there.
 
     Args:
@@ -160,7 +160,7 @@ def hidden_name(name: str, ending: str) -> str:
     return f".{name}{ending}"
 
 
-def atomic_output(path: str | Path, overwrite: bool = False) -> AbstractContextManager[Path]:
+def atomic_output(path: AnyPath, overwrite: bool = False) -> AbstractContextManager[Path]:
     """Yield a temporary path with the same suffix, and rename it to `path` on success.
 
     A link is kept, and its target replaced. A device or pipe is written to.
@@ -172,7 +172,7 @@ def atomic_output(path: str | Path, overwrite: bool = False) -> AbstractContextM
     return _copied(path) if is_stream(path) else _renamed(path, overwrite, folder=False)
 
 
-def atomic_folder(path: str | Path, overwrite: bool = False) -> AbstractContextManager[Path]:
+def atomic_folder(path: AnyPath, overwrite: bool = False) -> AbstractContextManager[Path]:
     """Yield a temporary folder, and rename it to `path` on success.
 
     If `path` exists, files of the same name are replaced and other files are kept.

@@ -70,10 +70,10 @@ def _lenses(path: Path) -> dict[str, tuple[float, float]]:
     with parsing(path):
         text = read_text(path).splitlines()
         if not text or not text[0].startswith("NVM_V3"):
-            raise InputError("not VisualSFM's NVM_V3", path=path)
+            raise InputError("not VisualSFM's NVM_V3")
         at = next((i for i, line in enumerate(text[1:], 1) if line.strip()), None)
         if at is None:
-            raise damaged("truncated: nothing follows its first line", path=path)
+            raise damaged("truncated: nothing follows its first line")
         rows = [line.replace("\t", " ").split() for line in text[at + 1 : at + 1 + int(text[at])]]
         lenses = {_stem(row[0]): (float(row[1]), float(row[9])) for row in rows}
     if not lenses:
@@ -105,7 +105,7 @@ def _lines(path: Path, heading: int = 0) -> Iterator[tuple[Place, str, Float]]:
         if number <= heading or not words or words[0].startswith("#"):
             continue
         try:
-            numbers = np.array(words[1:8], np.float64)
+            numbers = np.array(words[1:8], float)
         except ValueError:
             numbers = np.zeros(0)
         if len(numbers) != 7 or not np.isfinite(numbers).all():

@@ -4,6 +4,7 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
+from numpy.lib.recfunctions import unstructured_to_structured
 
 from g2ard.errors import InputError
 from g2ard.io import judge
@@ -74,7 +75,7 @@ class Stream(PointStream):
             columns = judge.unpacked(columns[0])
         noise = np.zeros(len(rows), bool)
         with np.errstate(invalid="ignore", over="ignore"):  # a signalling NaN
-            positions = np.stack([rows[self._named[axis]].astype(np.float64) for axis in _POSITION], axis=1)
+            positions = np.stack([rows[self._named[axis]].astype(float) for axis in _POSITION], axis=1)
             return positions, np.stack([noise, *columns], axis=1)[:, 1:].astype(np.float32), noise
 
 
@@ -96,11 +97,8 @@ def write_blocks(path: Path, count: int, blocks: Iterable[Points], *, overwrite:
     def rows_of(points: Points) -> Values:
         if not (np.isfinite(points.positions).all() and np.isfinite(points.colors).all()):
             raise InputError("not written: a point is not finite", path=path)
-        rows = np.empty(len(points), list(types.items()))
-        for axis in range(3):
-            rows[_POSITION[axis]] = points.positions[:, axis]
-            rows[COLOR_NAMES[0][axis]] = np.rint(np.clip(points.colors[:, axis], 0, 1) * 255)
-        return rows
+        colors = np.rint(np.clip(points.colors, 0, 1) * 255)
+        return unstructured_to_structured(np.hstack([points.positions, colors]), np.dtype([*types.items()]))
 
     if not count:
         raise InputError("not written: there are no points", path=path)

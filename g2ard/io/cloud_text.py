@@ -53,7 +53,7 @@ class Stream(HeldPoints):
             raise InputError(f"has no column {missing[0]!r} (found {' '.join(names)})")
         shades: tuple[str, ...] = next((names for names in _SHADES if set(names) <= set(column)), ())
         positions, values = (table[:, [column[name] for name in names]] for names in ("xyz", shades))
-        super().__init__(path, positions, values, judge.full_scales(np.dtype(np.float64)))
+        super().__init__(path, positions, values, judge.full_scales(np.dtype(float)))
         if not shades:
             self.lack = f"has no colours (found columns {' '.join(names)}); name them red, green and blue"
 
@@ -177,5 +177,5 @@ def _pcd(path: Path) -> tuple[list[str], Float]:
             columns += judge.unpacked(own[:, 0])
         else:
             names += [*_names(field), *(f"{field}_{k}" for k in range(1, own.shape[1]))]
-            columns += list(own.T.astype(np.float64))
+            columns += list(own.T.astype(float))
     return names, np.column_stack(columns)

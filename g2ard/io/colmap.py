@@ -325,10 +325,8 @@ class Table:
 
     def fault(self, names: Sequence[str], values: Sequence[float]) -> InputError | None:
         """Return what is wrong with the first of these values that is not finite."""
-        for name, value in zip(names, values, strict=True):
-            if not math.isfinite(value):
-                return self.place(name).error(f"is {value}")
-        return None
+        wrong = ((n, v) for n, v in zip(names, values, strict=True) if not math.isfinite(v))
+        return next((self.place(name).error(f"is {value}") for name, value in wrong), None)
 
     def _cut_off(self, name: str) -> InputError:
         return damaged("is cut off", path=self.path, property=name, index=self.row, item=self.item)

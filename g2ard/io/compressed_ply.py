@@ -106,13 +106,13 @@ class Stream(RawStream):
 def _between(bounds: Values, first: int, t: Float) -> Float:
     """Interpolate by `t` between the (chunks, 2, 3) bounds of each Gaussian's chunk, from row `first` on."""
     chunks = np.arange(first, first + len(t)) // _CHUNK_ROWS
-    low, high = bounds[chunks].astype(np.float64).swapaxes(0, 1)
+    low, high = bounds[chunks].astype(float).swapaxes(0, 1)
     return np.asarray(low * (1 - t) + high * t)
 
 
 def _coefficient(codes: Values) -> Float:
     """Decode bytes to [−4, 4]: bucket centres, except that the first and last bucket are the ends."""
-    t = (codes.astype(np.float64) + 0.5) / 256
+    t = (codes.astype(float) + 0.5) / 256
     return (np.select([codes == 0, codes == 255], [0.0, 1.0], t) - 0.5) * 8
 
 
@@ -155,7 +155,7 @@ def _within(values: Values) -> tuple[Float32, Float]:
     """Return the (chunks, 2, 3) bounds of the values of chunks, and values scaled to [0, 1] within them."""
     starts = np.arange(0, len(values), _CHUNK_ROWS)
     ends = [limit.reduceat(values, starts).astype(np.float32) for limit in (np.minimum, np.maximum)]
-    low, high = (end.astype(np.float64)[np.arange(len(values)) // _CHUNK_ROWS] for end in ends)
+    low, high = (end.astype(float)[np.arange(len(values)) // _CHUNK_ROWS] for end in ends)
     wide = high - low
     return np.stack(ends, axis=1), (values - low) / np.where(wide > 0, wide, 1.0)
 
@@ -180,7 +180,7 @@ def _unpacked(words: Values, bits: tuple[int, ...]) -> Float:
 
 def _harmonics(splats: Splats) -> Values:
     """Quantise coefficients in [−4, 4] to bytes, channel-major."""
-    values = splats.shN.swapaxes(1, 2).reshape(len(splats), -1).astype(np.float64)
+    values = splats.shN.swapaxes(1, 2).reshape(len(splats), -1).astype(float)
     codes = np.clip(np.floor((values / 8 + 0.5) * 256), 0, 255).astype(np.uint8)
     names = [(f"f_rest_{k}", "u1") for k in range(codes.shape[1])]
     return unstructured_to_structured(codes, np.dtype(names))

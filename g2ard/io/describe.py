@@ -70,7 +70,7 @@ def bytes_of(path: Path) -> int:
 
 
 def _quantiles(values: Values) -> dict[str, float]:
-    values_at = np.percentile(values.astype(np.float64), _QUANTILES)
+    values_at = np.percentile(values.astype(float), _QUANTILES)
     return {str(q): float(v) for q, v in zip(_QUANTILES, values_at, strict=True)}
 
 
@@ -89,7 +89,7 @@ def _splats(splats: Splats) -> Json:
         "render_model": splats.render_model,
         "bytes_as_ply": splats.nbytes,
         "offset": splats.offset.tolist(),
-        "extent": _extent(splats.means.astype(np.float64) + splats.offset),
+        "extent": _extent(splats.means.astype(float) + splats.offset),
         "opacity": _quantiles(opacities),
         "largest_scale": _quantiles(scales[:, 2]),
         "smallest_scale": _quantiles(scales[:, 0]),
@@ -108,7 +108,7 @@ def _points(points: Points) -> Json:
         "count": len(points),
         "extent": _extent(points.positions),
         "color": {
-            "mean": points.colors.mean(0, dtype=np.float64).tolist(),
+            "mean": points.colors.mean(0, dtype=float).tolist(),
             "min": points.colors.min(0).tolist(),
             "max": points.colors.max(0).tolist(),
         },

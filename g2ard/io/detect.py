@@ -14,7 +14,7 @@ from typing import Any, Literal
 from g2ard.config.choices import BLACK, Colour
 from g2ard.errors import InputError
 from g2ard.io.finding import usable
-from g2ard.io.paths import about, check_regular
+from g2ard.io.paths import AnyPath, about, check_regular
 from g2ard.io.signs import MESH, Sign, foreign, sign_of
 
 Kind = Literal["splats", "points", "views"]
@@ -105,7 +105,7 @@ _MOST_INSPECTED_FILES = 64  # maximum files of a folder to inspect for suggestio
 _MOST_SEARCHED_FILES = 256  # maximum files of a folder and those below to look for signs of other programs
 
 
-def kind(path: str | Path) -> Kind:
+def kind(path: AnyPath) -> Kind:
     """Return the kind of a file or folder: "splats", "points" or "views".
 
     A COLMAP folder is "views", although `read_points` reads its sparse points too.
@@ -119,7 +119,7 @@ def may_hold_views(path: Path) -> bool:
     return path.suffix.lower() != ".ply" and (named is None or KINDS[named] == "views")
 
 
-def file_format(path: str | Path) -> str:
+def file_format(path: AnyPath) -> str:
     """Return the format of a file or folder; raise an `InputError` if it is missing or unsupported."""
     path = run_scene(path)
     if path.is_dir():
@@ -205,7 +205,7 @@ _OWN = {
 """Suffixes of formats, and which of those that content tells they may have."""
 
 
-def run_scene(path: str | Path) -> Path:
+def run_scene(path: AnyPath) -> Path:
     """Return the scene's file in the folder of a `distill` run, or `path` itself."""
     path = Path(path)
     if not (path / "report.json").is_file():
@@ -216,14 +216,14 @@ def run_scene(path: str | Path) -> Path:
     return next((file for file in files if file.is_file()), path)
 
 
-def run_views(path: str | Path) -> Path:
+def run_views(path: AnyPath) -> Path:
     """Return the generated views in the folder of a `distill` run, or `path` itself."""
     path = Path(path)
     made = path / "views.json"
     return made if run_scene(path) != path and made.is_file() else path
 
 
-def run_background(path: str | Path) -> Colour | None:
+def run_background(path: AnyPath) -> Colour | None:
     """Return the background that a `distill` run in a folder was made with, or None."""
     from g2ard.io.jsonfile import Place, Within1, checked, read_json
 
@@ -257,7 +257,7 @@ def json_format(content: Any) -> str | None:
     return next((name for name, (own, needed) in _JSON.items() if own is kind and needed <= keys), None)
 
 
-def find_views(scene: str | Path) -> Path | None:
+def find_views(scene: AnyPath) -> Path | None:
     """Return the path of the cameras that a scene was trained with, for `read_view_set`, or None.
 
     Searched in this order:

@@ -51,7 +51,7 @@ class Stream(JoinedClouds):
             self._photos = sum(node.isDefined("pose") for node in _images(file))
             scans = [_Scan(path, header, number) for number, header in enumerate(headers) if counts[number]]
         if not scans:
-            raise InputError("has no points", path=path)
+            raise InputError("has no points")
         super().__init__(scans)
 
     def identity(self) -> list[Any]:
@@ -86,14 +86,14 @@ class _Scan(PointStream):
         place = next((fields for fields in (_CARTESIAN, _SPHERICAL) if names.issuperset(fields)), None)
         if place is None:
             what = "has no positions (cartesianX, cartesianY, cartesianZ)"
-            raise InputError(what, path=path, index=number, item="scan")
+            raise InputError(what, index=number, item="scan")
         self._place = place
-        self._rotation = rotation_matrices(np.asarray(header.rotation, np.float64)[None])[0]
-        self._translation = np.asarray(header.translation, np.float64)
+        self._rotation = rotation_matrices(np.asarray(header.rotation, float)[None])[0]
+        self._translation = np.asarray(header.translation, float)
         choices = [fields for fields in (_COLORS, _INTENSITY) if names.issuperset(fields)]
         self._color, sample = telling(choices, self._sampled)
         limits = _limits(header, "intensity") if self._color == _INTENSITY else None
-        scales = judge.full_scales(np.dtype(np.float64))
+        scales = judge.full_scales(np.dtype(float))
         super().__init__(path, self.count, sample, scales, limits)
         self.axes = "RFU"
         if self.channels == 3 and (stated := _limits(header, "colorRed")):
@@ -203,17 +203,17 @@ def read(views: ViewFiles) -> Listed:
     """
     path, images = views.path, views.images
     if images is not None:
-        raise InputError("has its photos inside", path=path, hint="leave {images} out")
+        raise InputError("has its photos inside", hint="leave {images} out")
     with _opened(path) as file:
         nodes = _images(file)
         if not nodes:
-            raise InputError("holds no photos", path=path, hint="give views with photos of their own")
+            raise InputError("holds no photos", hint="give views with photos of their own")
         folder = _cache_of(path)
         found = [_frame(number, node, folder) for number, node in enumerate(nodes)]
     frames = [frame for frame in found if isinstance(frame, Frame)]
     left_out = [reason for reason in found if isinstance(reason, str)]
     if not frames:
-        raise InputError(f"none of its {plural(len(nodes), 'photo')} can be used: {left_out[0]}", path=path)
+        raise InputError(f"none of its {plural(len(nodes), 'photo')} can be used: {left_out[0]}")
     text = f"{plural(len(left_out), 'photo')} of {len(nodes)} left out: {left_out[0] if left_out else ''}"
     return Listed(path, frames).noted("left_out_photos", len(left_out), text)
 

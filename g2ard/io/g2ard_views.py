@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
 from pathlib import Path
 
 import msgspec
@@ -15,7 +14,7 @@ from g2ard.io.finding import Finder
 from g2ard.io.jsonfile import Json, Matrix, Number, Place, Pose, Weight, Whole, checked, read_own
 from g2ard.io.paths import beside
 from g2ard.io.photos import Frame, Lens, Listed, rigid
-from g2ard.io.types import Float, ViewFiles
+from g2ard.io.types import Float, Splits, ViewFiles
 from g2ard.progress import plural
 from g2ard.scene.cameras import USUAL, Cameras
 from g2ard.scene.lenses import PARAMETERS, PhotoLens
@@ -100,10 +99,10 @@ def _written(lens: PhotoLens | None) -> Json | None:
     return {"model": lens.model, "size": lens.size, "params": lens.params, "turn": turn}
 
 
-def text_of(path: Path, cameras: Cameras, splits: Sequence[str | None], weights: ArrayLike | None) -> str:
+def text_of(path: Path, cameras: Cameras, splits: Splits, weights: ArrayLike | None) -> str:
     """Return views, one per line, with exact floats; see `g2ard.io.write_views`."""
     count = len(cameras)
-    given = np.full(count, np.nan) if weights is None else np.asarray(weights, np.float64)
+    given = np.full(count, np.nan) if weights is None else np.asarray(weights, float)
     drawn = [None if np.isnan(weight) else weight for weight in given.tolist()]
     parts = list(splits) or [None] * count
     if len(parts) != count or len(drawn) != count:

@@ -122,9 +122,9 @@ def spz_glb(path: Path, splats: Splats, centre: Float | None = None) -> tuple[li
     The node's translation is the scene's `offset`, and `centre`, which makes coordinates small.
     """
     movable, centre = centre is not None, np.zeros(3) if centre is None else centre
-    bits = spz.fraction_bits(path, splats.means.astype(np.float64) - centre, splats, movable=movable)
+    bits = spz.fraction_bits(path, splats.means.astype(float) - centre, splats, movable=movable)
     splats = splats.take(packing_order(splats.means))
-    means = (splats.means.astype(np.float64) - centre) * (-1, 1, -1)
+    means = (splats.means.astype(float) - centre) * (-1, 1, -1)
     blob = spz.encoded(path, _about_y(splats), means, bits, _SPZ_VERSION)
     stored = np.rint(means * (1, -1, -1) * (1 << bits)) / (1 << bits)
     ends = {end: getattr(stored, end)(axis=0).tolist() for end in ("min", "max")}
@@ -175,22 +175,21 @@ def _glb(path: Path, document: Json, blobs: list[bytes]) -> list[bytes]:
 
 
 def _attributes(splats: Splats) -> dict[str, Values]:
-    linear = np.clip(splats.colors.astype(np.float64), 0, 1)
+    linear = np.clip(splats.colors.astype(float), 0, 1)
     linear = np.where(linear <= 0.04045, linear / 12.92, ((linear + 0.055) / 1.055) ** 2.4)
     alphas = splats.opacities[:, None]
     quats = unit_quats(splats.quats)
     turned = quats[:, [1, 2, 3, 0]] * (*_GLTF_TURN, 1)
     out: dict[str, Values] = {
-        "POSITION": (splats.means * _GLTF_TURN).astype("<f4"),
+        "POSITION": splats.means * _GLTF_TURN,
         "COLOR_0": np.rint(np.column_stack([linear, alphas]) * 65535).astype("<u2"),
-        f"{EXTENSION}:ROTATION": turned.astype("<f4"),
-        f"{EXTENSION}:SCALE": splats.scales.astype("<f4"),
-        f"{EXTENSION}:OPACITY": alphas.astype("<f4"),
-        f"{EXTENSION}:SH_DEGREE_0_COEF_0": splats.sh0[:, 0].astype("<f4"),
+        f"{EXTENSION}:ROTATION": turned,
+        f"{EXTENSION}:SCALE": splats.scales,
+        f"{EXTENSION}:OPACITY": alphas,
+        f"{EXTENSION}:SH_DEGREE_0_COEF_0": splats.sh0[:, 0],
     }
-    for name, k in _harmonics(splats.sh_degree):
-        out[name] = (splats.shN[:, k] * _SH_FLIPS[k]).astype("<f4")
-    return out
+    out |= {name: splats.shN[:, k] * _SH_FLIPS[k] for name, k in _harmonics(splats.sh_degree)}
+    return {name: v.astype("<f4") if v.dtype.kind == "f" else v for name, v in out.items()}
 
 
 def _harmonics(degree: int) -> list[tuple[str, int]]:

@@ -457,7 +457,7 @@ def _averaged(image: Float32, length: int, axis: int) -> Float32:
     """Return exact means over `length` equal parts of an axis, from differences of its running sum."""
     count = image.shape[axis]
     pad = [(1, 0) if i == axis else (0, 0) for i in range(3)]
-    sums = np.pad(np.cumsum(image, axis=axis, dtype=np.float64), pad)
+    sums = np.pad(np.cumsum(image, axis=axis, dtype=float), pad)
     edges = np.linspace(0, count, length + 1)
     below = np.minimum(edges.astype(int), count - 1)
     share = np.expand_dims(edges - below, [i for i in range(3) if i != axis])

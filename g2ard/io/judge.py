@@ -85,7 +85,7 @@ def spacing(positions: Values, count: int) -> float:
 def unpacked(packed: Values) -> list[Float]:
     """Return red, green and blue of PCL's colours, 0xRRGGBB in 32-bit integers or in floats of these bits."""
     bits = np.ascontiguousarray(packed).view("<u4")
-    return [(bits >> shift & 255).astype(np.float64) for shift in (16, 8, 0)]
+    return [(bits >> shift & 255).astype(float) for shift in (16, 8, 0)]
 
 
 def shades(values: Values, limits: tuple[float, float] | None = None) -> tuple[float, float]:
@@ -121,7 +121,7 @@ class Reading:
         """Return logits; opacities past [0, 1] are clamped."""
         if self.opaque is None:
             return values
-        return logits_of(np.clip(values.astype(np.float64) / self.opaque, 0, 1))
+        return logits_of(np.clip(values.astype(float) / self.opaque, 0, 1))
 
     def sh0(self, values: Values) -> Values:
         """Return coefficients of band 0."""
@@ -177,7 +177,7 @@ def fill(raw: Raw, scales: Values, opacities: Values, base: Values) -> list[Note
     """Fill in a scene of a format of linear scales and opacities, as they are judged; return notes."""
     read = judged(scales, opacities, base, logs=False)
     with np.errstate(divide="ignore", invalid="ignore"):
-        raw.log_scales[:] = scales if read.log_scales else np.log(scales.astype(np.float64))
+        raw.log_scales[:] = scales if read.log_scales else np.log(scales.astype(float))
         raw.logit_opacities[:], raw.sh0[:, 0] = read.opacity_logits(opacities), read.sh0(base)
     return list(read.notes)
 

@@ -95,7 +95,7 @@ def _rows(
     raw.set_linear(rows["scale"], rows["rgba"][:, 3] / 255)
     raw.quats[:] = rows["quat"]
     raw.sh0[:, 0] = (rows["rgba"][:, :3] / 255 - 0.5) / SH_C0
-    values = rows["sh"].astype(np.float64)
+    values = rows["sh"].astype(float)
     if level == 2:
         values = values / 255 * (limits[1] - limits[0]) + limits[0]
     raw.shN[:] = values[:, _SH_ORDER[:harmonics]].reshape(raw.shN.shape)
@@ -112,7 +112,7 @@ def _centres(data: bytes, i: int, at: int, section: dict[str, Any], steps: Value
     if lengths.sum() < len(steps):
         raise damaged("has more rows than its buckets hold", index=i, item="section")
     table = np.frombuffer(data, "u1", buckets * size, at + 4 * partial).reshape(buckets, size)
-    centres = np.ascontiguousarray(table[:, :12]).view("<f4").astype(np.float64)
+    centres = np.ascontiguousarray(table[:, :12]).view("<f4").astype(float)
     bucket = np.repeat(np.arange(buckets), np.minimum(lengths, len(steps)))[: len(steps)]
     half = section["steps"] or _SCALE_RANGE
-    return (steps.astype(np.float64) - half) * (section["block"] / 2 / half) + centres[bucket]
+    return (steps.astype(float) - half) * (section["block"] / 2 / half) + centres[bucket]

@@ -46,7 +46,7 @@ class Stream(PointStream):
                 runs.append(reader.read_points(min(_SAMPLE_ROWS, count - first)))
             text = f"the header states 0 points; {count:,} follow, and are read"
             notes = (Note("header_count", count, text),) if reader.recovered else ()
-            system, metres_per_unit = _system(header), _metres_per_unit(header)
+            system, metres_per_unit = _map_of(header)
 
         def sampled(color: Names) -> list[MarkedPoints]:
             return [_points(run, color) for run in runs] or [_NOTHING]
@@ -73,45 +73,31 @@ class Stream(PointStream):
 
 
 def _points(las: Any, color: Names) -> MarkedPoints:
-    positions = np.stack([np.asarray(las[name], np.float64) for name in ("x", "y", "z")], axis=1)
+    positions = np.stack([np.asarray(las[name], float) for name in ("x", "y", "z")], axis=1)
     values = np.stack([np.asarray(las[name], np.float32) for name in color], axis=1)
     noise = np.isin(np.asarray(las["classification"]), _NOISE) | np.asarray(las["withheld"], bool)
     return positions, values, noise
-
-
-def _system(header: Any) -> str | None:
-    """Return the map system that a header states: its EPSG code, or otherwise its name."""
-    for record in header.vlrs:
-        if record.record_id == 34735 and hasattr(record, "geo_keys"):
-            codes = {key.id: key.value_offset for key in record.geo_keys}
-            code = next((codes[key] for key in (3072, 2048) if 0 < codes.get(key, 0) < 32767), None)
-            if code:
-                return f"EPSG:{code}"
-        if record.record_id == 2112 and hasattr(record, "string"):
-            found = re.search(r'PROJ(?:CS|CRS)\["([^"]+)"(.*)', record.string, re.DOTALL)
-            if found:
-                own = re.split(r"VERT_?C(?:S|RS)\[", found[2])[0]
-                code = re.search(r'(?:AUTHORITY|ID)\["EPSG",\s*"?(\d+)"?\][\]\s,\0]*$', own)
-                return f"EPSG:{code[1]}" if code else found[1]
-    return None
 
 
 _UNITS = {9001: 1.0, 9002: 0.3048, 9003: 1200 / 3937}
 """Code of a unit of length in GeoTIFF keys → its metres."""
 
 
-def _metres_per_unit(header: Any) -> float | None:
-    """Return the metres of the unit of positions, if a header states its map system."""
+def _map_of(header: Any) -> tuple[str | None, float | None]:
+    """Return the map system that a header states, by EPSG code or name, and the metres of its unit."""
+    systems, units = list[str](), list[float]()
     for record in header.vlrs:
         if record.record_id == 34735 and hasattr(record, "geo_keys"):
             codes = {key.id: key.value_offset for key in record.geo_keys}
-            if codes.get(3076) in _UNITS:
-                return _UNITS[codes[3076]]
-        if record.record_id == 2112 and hasattr(record, "string") and "PROJ" in record.string:
-            own = re.split(r"VERT_?C(?:S|RS)\[", record.string[record.string.index("PROJ") :])[0]
-            if found := re.findall(r'UNIT\["[^"]*",\s*([0-9.eE+-]+)', own):
-                return float(found[-1])
-    return None
+            systems += [f"EPSG:{codes[key]}" for key in (3072, 2048) if 0 < codes.get(key, 0) < 32767]
+            units += [_UNITS[codes[3076]]] if codes.get(3076) in _UNITS else []
+        if record.record_id == 2112 and hasattr(record, "string"):
+            for name, rest in re.findall(r'PROJ(?:CS|CRS)\["([^"]+)"(.*)', record.string, re.DOTALL):
+                own = re.split(r"VERT_?C(?:S|RS)\[", rest)[0]
+                code = re.search(r'(?:AUTHORITY|ID)\["EPSG",\s*"?(\d+)"?\][\]\s,\0]*$', own)
+                systems.append(f"EPSG:{code[1]}" if code else name)
+                units += map(float, re.findall(r'UNIT\["[^"]*",\s*([0-9.eE+-]+)', own)[-1:])
+    return next(iter(systems), None), next(iter(units), None)
 
 
 @contextmanager

@@ -43,7 +43,7 @@ def read(views: ViewFiles) -> Listed:
         text = f"has {plural(len(rows), 'pose')} for {plural(len(photos), 'photo')} in {photos[0].parent}"
         raise InputError(text, path=file, hint="{images=DIR} names the folder with one photo per pose")
     frames = []
-    for i, row in enumerate(rows.astype(np.float64)):
+    for i, row in enumerate(rows.astype(float)):
         matrix = row[:15].reshape(3, 5)
         photo = photos[i] if photos else None
         frames.append(_frame(Place(file, i, "row"), matrix, photo))

@@ -60,7 +60,7 @@ def as_packed(path: Path, splats: Splats) -> Splats:
     Viewers keep such positions in half floats, which end at 65,504.
     """
     form = as_stored(writable(path, splats))
-    middle = np.rint(np.median(form.means.astype(np.float64), axis=0))
+    middle = np.rint(np.median(form.means.astype(float), axis=0))
     return form.recentred(form.offset + middle) if np.abs(middle).max() > FAR_FROM_ORIGIN else form
 
 
@@ -74,7 +74,7 @@ def packing_order(means: Values, chunk: int = 1) -> NDArray[np.intp]:
     >>> packing_order(np.array([[1.0, 1, 1], [0, 0, 0], [0.9, 1, 1]])).tolist()
     [1, 2, 0]
     """
-    away = np.linalg.norm(means.astype(np.float64) - np.median(means, axis=0), axis=1)
+    away = np.linalg.norm(means.astype(float) - np.median(means, axis=0), axis=1)
     near = _NEAR * np.percentile(away, 75)
     if not near > 0 or away.max() < near:
         return morton_order(means)
@@ -88,7 +88,7 @@ def packing_order(means: Values, chunk: int = 1) -> NDArray[np.intp]:
 
 def morton_order(means: Values) -> NDArray[np.intp]:
     """Return rows in Morton order (2²¹ cells per axis, ties by row)."""
-    low, high = means.min(axis=0).astype(np.float64), means.max(axis=0).astype(np.float64)
+    low, high = means.min(axis=0).astype(float), means.max(axis=0).astype(float)
     size = max(float((high - low).max()), np.finfo(float).tiny)
     cells = ((means - low) / size * ((1 << _MORTON_BITS) - 1)).astype(np.uint64)
     code = np.zeros(len(means), np.uint64)
@@ -112,13 +112,13 @@ def _spread(v: NDArray[np.uint64]) -> NDArray[np.uint64]:
 def log_scales(splats: Splats) -> Float:
     """Return the (N, 3) natural logarithms of scales, clamped to the limits of readers."""
     with np.errstate(divide="ignore"):
-        logs = np.log(splats.scales.astype(np.float64))
+        logs = np.log(splats.scales.astype(float))
     return np.clip(logs, -LOG_SCALE_LIMIT, LOG_SCALE_LIMIT)
 
 
 def unit_quats(quats: Values) -> Float:
     """Normalise (N, 4) quaternions; zeros become the identity."""
-    q = quats.astype(np.float64)
+    q = quats.astype(float)
     q /= np.maximum(np.abs(q).max(axis=1, keepdims=True), np.finfo(float).tiny)
     norms = np.linalg.norm(q, axis=1, keepdims=True)
     return np.where(norms > 0, q / np.maximum(norms, 0.5), [1.0, 0, 0, 0])

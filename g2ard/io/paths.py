@@ -14,13 +14,15 @@ from typing import Any
 
 from g2ard.errors import G2ardError, InputError
 
+AnyPath = str | Path
+
 _LONGEST_NAME = 200  # longest file name, bytes; systems allow 255, including suffixes and temporary names
 
 _LARGEST_RATIO = 100
 _ALWAYS_UNPACKED = 64 << 20  # bytes that any file may unpack to; larger ones are limited by `_LARGEST_RATIO`
 
 
-def real_path(path: str | Path) -> Path:
+def real_path(path: AnyPath) -> Path:
     """Return the path with links resolved; circular links are kept (`Path.resolve` would raise)."""
     return Path(os.path.realpath(path))
 
@@ -101,7 +103,7 @@ NOT_FINITE = re.compile(r"[+-]?(nan\([^)\s]*\)|\d\.#\w+|\b(null|none|n/?a)\b)", 
 """Numbers that are not finite, as C and C++ write them on Windows, and words for missing ones."""
 
 
-def output_names(path: str | Path, names: Sequence[str]) -> list[str]:
+def output_names(path: AnyPath, names: Sequence[str]) -> list[str]:
     """Return file names for views, without suffix, that stay inside one folder.
 
     Roots, drives and `..` are removed. Names that only differ in their suffix keep it. Names that are invalid
@@ -120,7 +122,7 @@ def output_names(path: str | Path, names: Sequence[str]) -> list[str]:
     return [str(place) for place in places]
 
 
-def _inside(path: str | Path, i: int, name: str) -> PurePosixPath:
+def _inside(path: AnyPath, i: int, name: str) -> PurePosixPath:
     parts = PurePosixPath(PureWindowsPath(name.replace("\0", "")).as_posix()).parts
     kept = [part for part in parts if part not in ("..", "/", "//") and not part.endswith((":", ":/"))]
     if not kept or "\0" in name or max(len(part.encode(errors="replace")) for part in kept) > _LONGEST_NAME:

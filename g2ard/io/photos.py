@@ -26,7 +26,7 @@ from g2ard.io.finding import (
     usable,
 )
 from g2ard.io.jsonfile import Place
-from g2ard.io.paths import check_regular
+from g2ard.io.paths import about, check_regular
 from g2ard.io.signs import PHOTOS, foreign
 from g2ard.io.types import Float, Note, Notes, Size, ViewSet
 from g2ard.progress import plural
@@ -77,7 +77,7 @@ class Lens(NamedTuple):
     ) -> Lens:
         """Return the lens of focal lengths and a principal point, None for the middle of the image."""
         (fx, fy), (cx, cy) = focal, (size[0] / 2, size[1] / 2) if middle is None else middle
-        return cls(size, np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], np.float64), distortion)
+        return cls(size, np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], float), distortion)
 
     @classmethod
     def of(cls, photo: PhotoLens) -> Lens:
@@ -134,22 +134,23 @@ def opened_image(path: Path, content: IO[bytes] | None = None) -> Iterator[Image
 
     if content is None:
         check_regular(path)
-    try:
-        with Image.open(content or path) as image:
-            check_image(*image.size, path=path)
-            yield image
-    except InputError:
-        raise
-    except FileNotFoundError as error:
-        raise InputError("no such photo", path=path) from error
-    except Image.DecompressionBombError as error:
-        raise InputError(f"has more than {LARGEST_IMAGE:,} pixels", path=path) from error
-    except UnidentifiedImageError as error:
-        if content is None and _begins(path, _TIFF):
-            raise InputError(_OTHER_TIFF, path=path, hint=_CONVERT_TIFF) from error
-        raise InputError("is not an image", path=path) from error
-    except Exception as error:  # Pillow's decoders raise any exception for damaged files
-        raise damaged(f"cannot be decoded ({str(error) or type(error).__name__})", path=path) from error
+    with about(path):
+        try:
+            with Image.open(content or path) as image:
+                check_image(*image.size)
+                yield image
+        except InputError:
+            raise
+        except FileNotFoundError as error:
+            raise InputError("no such photo") from error
+        except Image.DecompressionBombError as error:
+            raise InputError(f"has more than {LARGEST_IMAGE:,} pixels") from error
+        except UnidentifiedImageError as error:
+            if content is None and _begins(path, _TIFF):
+                raise InputError(_OTHER_TIFF, hint=_CONVERT_TIFF) from error
+            raise InputError("is not an image") from error
+        except Exception as error:  # Pillow's decoders raise any exception for damaged files
+            raise damaged(f"cannot be decoded ({str(error) or type(error).__name__})") from error
 
 
 _TIFF = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")

@@ -16,7 +16,7 @@ from g2ard.io.stream import RawStream, SceneStream
 from g2ard.io.types import Float, Float32, Note, Values
 from g2ard.progress import plural, some
 from g2ard.scene.splats import SH_C0, Splats, far_middle, unit_quats
-from g2ard.scene.transform import as_stored, stand_as
+from g2ard.scene.transform import as_stored
 
 _MEANS = ["x", "y", "z"]
 _DC = ["f_dc_0", "f_dc_1", "f_dc_2"]
@@ -25,6 +25,8 @@ _QUATS = ["rot_0", "rot_1", "rot_2", "rot_3"]
 _REQUIRED_PROPERTIES = [*_MEANS, *_DC, "opacity", *_SCALES, *_QUATS]
 _NORMALS = ["nx", "ny", "nz"]
 _FILTER = "filter_3d"
+_FILTERED = "the 3D filter of Mip-Splatting is applied to scales and opacities"
+_FLAT = "2DGS scene read as flat Gaussians; renders differ where surfaces are seen at a slant"
 _TIME = re.compile(
     r"t|time\w*|\w*_t|trbf\w*|motion\w*|omega\w*|rot_r_?\d|vel\w*|v[xyz]|(start|end)_time|dur\w*"
 )
@@ -72,15 +74,12 @@ class Stream(RawStream):
         moving = [name for name in names if _TIME.fullmatch(name)]
         moving += [name for name in _DEFORMS if (path.absolute().parent / name).exists()]
         notes = [*_frames(header), *_ignored([n for n in names if n not in needed], rest, stored, kept)]
-        if moving:
-            text = f"the scene moves in time ({', '.join(moving[:3])}); all times are read as one"
-            notes.append(Note("moving", len(moving), text))
-        if flat:
-            text = "2DGS scene read as flat Gaussians; renders differ where surfaces are seen at a slant"
-            notes.append(Note("flat_gaussians", len(rows), text))
-        if _FILTER in names:
-            text = "the 3D filter of Mip-Splatting is applied to scales and opacities"
-            notes.append(Note("mip_filter", len(rows), text))
+        told = {
+            "moving": (len(moving), f"the scene moves in time ({some(moving)}); all times are read as one"),
+            "flat_gaussians": (flat * len(rows), _FLAT),
+            "mip_filter": ((_FILTER in names) * len(rows), _FILTERED),
+        }
+        notes += [Note(code, count, text) for code, (count, text) in told.items() if count]
         model: RenderModel = "antialiased" if mode == "antialiased" and not flat else "classic"
         super().__init__(path, len(rows), kept, offset, tuple(notes), model)
         self.up = plyfiles.up_of(header.comments)
@@ -142,7 +141,7 @@ class Stream(RawStream):
         raw.quats[:] = quats - (128.0 if quats.dtype == np.uint8 else 0.0)  # of bytes, 128 is 0
         raw.logit_opacities[:] = self._read.opacity_logits(block[self._names["opacity"]])
         if _FILTER in self._names:
-            _widen(raw, np.asarray(block[self._names[_FILTER]], np.float64))
+            _widen(raw, np.asarray(block[self._names[_FILTER]], float))
         if self._rest:  # channel-major: all of red's coefficients, then green's, then blue's
             bands = self._columns(block, self._rest).reshape(-1, 3, self._stored)
             for channel in range(3):  # three times as fast as a transposed copy
@@ -167,11 +166,11 @@ def _joined(groups: list[Values]) -> Values:
 
 def _widen(raw: Raw, size: Float) -> None:
     """Apply the 3D filter of Mip-Splatting of (n,) sizes f: σ² + f², and α·√(Πσ² / Π(σ² + f²))."""
-    before = 2 * raw.log_scales.astype(np.float64)
+    before = 2 * raw.log_scales.astype(float)
     with np.errstate(divide="ignore"):
         after = np.logaddexp(before, 2 * np.log(np.abs(size))[:, None])
     fading = 0.5 * (before - after).sum(axis=1)
-    logits = raw.logit_opacities.astype(np.float64)
+    logits = raw.logit_opacities.astype(float)
     lit, dark = -np.logaddexp(0, -logits), -np.logaddexp(0, logits)  # logarithms of α and 1 − α
     with np.errstate(divide="ignore"):
         faded = np.logaddexp(dark, lit + np.log(-np.expm1(fading)))
@@ -234,7 +233,7 @@ def write(
         error, frame = rounding(scene, scene.narrowed()), as_stored(scene)
         count, parts = len(frame), iter([frame])
     else:
-        frame = as_stored(_nothing_of(scene))
+        frame = as_stored(scene.placed(Raw.empty(0, 0)))
         count, parts = scene.count, map(as_stored, scene.blocks(BLOCK))
     if not count:
         raise InputError("not written: the scene has no Gaussians", path=path)
@@ -249,19 +248,12 @@ def write(
     return error
 
 
-def _nothing_of(scene: SceneStream) -> Splats:
-    """Return a scene without rows that stands as the stream does."""
-    nothing = np.zeros((0, 3))
-    empty = Splats.create(nothing, scales=nothing, offset=scene.offset, render_model=scene.render_model)
-    return stand_as(empty, scene)
-
-
 def _blocks(path: Path, parts: Iterable[Splats], names: list[str], normals: bool) -> Iterator[Float32]:
     first = 0
     for block in (part.take(slice(at, at + BLOCK)) for part in parts for at in range(0, len(part), BLOCK)):
         n = len(block)
         with np.errstate(divide="ignore", invalid="ignore"):
-            logs = np.clip(np.log(block.scales, dtype=np.float64), -LOG_SCALE_LIMIT, LOG_SCALE_LIMIT)
+            logs = np.clip(np.log(block.scales, dtype=float), -LOG_SCALE_LIMIT, LOG_SCALE_LIMIT)
         columns = [
             block.means,
             np.zeros((n, 3 if normals else 0)),

@@ -66,20 +66,22 @@ class PlyHeader:
 
 def read_header(path: Path) -> PlyHeader:
     with about(path), path.open("rb") as file:
-        head = file.read(_HEADER_LIMIT)
+        return _header(file.read(_HEADER_LIMIT))
+
+
+def _header(head: bytes) -> PlyHeader:
     if not head:
-        raise InputError("is empty", path=path)
+        raise InputError("is empty")
     start = len(_MARK) if head.startswith(_MARK) else 0
     head = head[start:]
     if head[:3] != b"ply" or head[3:4] not in b"\r\n":
         raise InputError(
             f"is not a PLY file (begins with {head[:8]!r}, expected 'ply')",
-            path=path,
             hint="export it again, or rename it to the suffix of its format",
         )
     end = _END_HEADER.search(head)  # on a line of its own, since comments may contain it
     if end is None:
-        raise damaged("broken PLY header: no end_header line", path=path)
+        raise damaged("broken PLY header: no end_header line")
     eol = b"\r\n" if head[3:5] == b"\r\n" else head[3:4]
     head = head[: end.start(1) + len(eol)]  # rows may begin with a newline
     span, head = range(start, start + len(head)), head.translate(_ASCII)
@@ -87,7 +89,7 @@ def read_header(path: Path) -> PlyHeader:
         counts = {name.decode(): int(count) for _, name, count in _COUNT.findall(head)}
         ply = PlyData.read(io.BytesIO(_COUNT.sub(rb"\g<1>0", head)), mmap=False)
     except (PlyParseError, ValueError) as error:
-        raise damaged(f"broken PLY header, {error}", path=path) from error
+        raise damaged(f"broken PLY header, {error}") from error
     comments = [*ply.comments, *(text for element in ply for text in element.comments)]
     return PlyHeader(ply, counts, [" ".join(text.split()) for text in comments], span)
 

@@ -43,7 +43,7 @@ def read(views: ViewFiles) -> Listed:
     path, images = views.path, views.images
     folders = cameras_in(path)
     if folders is None:
-        raise InputError("has no keyframes/cameras with .json files", path=path)
+        raise InputError("has no keyframes/cameras with .json files")
     cameras, photos = folders
     files = sorted(files_in(cameras, ".json"), key=lambda file: (len(file.stem), file.stem))
     finder = Finder(images or photos)

@@ -60,8 +60,8 @@ class Raw:
     def set_linear(self, scales: Values, alphas: Values) -> None:
         """Store scales and opacities as logarithms and logits; rows of negative scales become NaN."""
         with np.errstate(divide="ignore", invalid="ignore"):
-            self.log_scales[:] = np.log(scales.astype(np.float64))
-            self.logit_opacities[:] = logits_of(alphas.astype(np.float64))
+            self.log_scales[:] = np.log(scales.astype(float))
+            self.logit_opacities[:] = logits_of(alphas.astype(float))
 
     def activated(self, render_model: RenderModel, offset: Float, axis: _Up = None) -> Splats:
         """Return the scene, after `Tally.clean` has exponentiated `log_scales` in place."""
@@ -138,7 +138,7 @@ class Tally:
         np.clip(logits, -LOGIT_LIMIT, LOGIT_LIMIT, out=logits)
         self.scales += int(np.count_nonzero(good[:, None] & (np.abs(scales) > LOG_SCALE_LIMIT)))
         np.clip(scales, -LOG_SCALE_LIMIT, LOG_SCALE_LIMIT, out=scales)
-        scales[:] = np.exp(scales, dtype=np.float64)
+        scales[:] = np.exp(scales, dtype=float)
         zero = good & ~quats.any(1)
         if zero.any():
             self.quats += int(np.count_nonzero(zero))

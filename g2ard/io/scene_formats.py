@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from g2ard.config.choices import FormatName
 from g2ard.errors import OutputError
+from g2ard.io.paths import AnyPath
 
 if TYPE_CHECKING:
     from g2ard.io.types import Note
@@ -57,7 +58,7 @@ _VISIBLE_ROUNDING = 0.01
 _FOLDER = SceneFormat("meta.json", "sog_write", "write_folder", lossy=True, tells=True)
 
 
-def scene_format(path: str | Path) -> SceneFormat:
+def scene_format(path: AnyPath) -> SceneFormat:
     """Return the format of an output path, or raise an `OutputError` if it is unsupported.
 
     >>> scene_format("a.COMPRESSED.PLY").module, scene_format("room/meta.json").function
@@ -87,7 +88,7 @@ def written_bytes(path: Path) -> int:
     return sum(file.stat().st_size for file in files)
 
 
-def lost_in(path: str | Path, splats: Splats, **options: object) -> list[Note]:
+def lost_in(path: AnyPath, splats: Splats, **options: object) -> list[Note]:
     """Return notes on what the format of an output path cannot hold; `options` are the writer's."""
     from g2ard.io.types import Note
 
@@ -105,7 +106,7 @@ def lost_in(path: str | Path, splats: Splats, **options: object) -> list[Note]:
     return notes
 
 
-def _unstated(path: str | Path, splats: Splats) -> str | None:
+def _unstated(path: AnyPath, splats: Splats) -> str | None:
     """Return how to get back coordinates that a .splat cannot state."""
     from g2ard.io.splat import form_of
 
@@ -120,7 +121,7 @@ def _unstated(path: str | Path, splats: Splats) -> str | None:
     )
 
 
-def check_positions(path: str | Path, splats: Splats, count: int | None = None) -> None:
+def check_positions(path: AnyPath, splats: Splats, count: int | None = None) -> None:
     """Raise the `InputError` of writing a scene whose positions the format cannot hold, before the work.
 
     Gaussians of surfaces widen with the root of the ratio when the scene is reduced to `count`.
@@ -166,7 +167,7 @@ class Rounding:
         return [Note("rounded_positions", self._count, text)] if self._told else []
 
 
-def axes_note(path: str | Path, options: dict[str, Any]) -> str | None:
+def axes_note(path: AnyPath, options: dict[str, Any]) -> str | None:
     """Return a note on the axes of a written file if programs differ in them; `options` are the writer's."""
     output_format, axes = scene_format(path), options.get("axes")
     if output_format.suffix != ".spz" or (axes is not None and options.get("spz_version", 3) == 4):
@@ -182,7 +183,7 @@ def axes_note(path: str | Path, options: dict[str, Any]) -> str | None:
     )
 
 
-def check_options(path: str | Path, options: dict[str, object]) -> SceneFormat:
+def check_options(path: AnyPath, options: dict[str, object]) -> SceneFormat:
     """Return the format of an output path, or raise an `OutputError` if it lacks one of the options."""
     output_format = scene_format(path)
     for name in options:

@@ -147,7 +147,7 @@ def write_table(path: Path, splats: Splats, *, overwrite: bool = False) -> None:
                 file.write(",".join(table) + "\r\n")
             far = splats.offset.any()
             digits = ["%.17g" if far and name in ("x", "y", "z") else "%.9g" for name in table]
-            rows = np.column_stack([values.astype(np.float64) for values in table.values()])
+            rows = np.column_stack([values.astype(float) for values in table.values()])
             np.savetxt(file, rows, fmt=digits, delimiter=",", newline="\r\n")
 
 

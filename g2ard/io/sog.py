@@ -257,7 +257,7 @@ def _values(place: Place, part: _Part) -> Callable[[Bytes], Values]:
     if part.codebook is UNSET:
         low, high = _ends(place, part, slice(3))
         return lambda codes: low + (high - low) * (codes / 255)
-    place, book = place.to("codebook"), np.array(part.codebook, np.float64)
+    place, book = place.to("codebook"), np.array(part.codebook, float)
     wrong = np.isfinite(book) & (np.abs(book) > _LARGEST_FLOAT32)
     if wrong.any():
         raise place.to(int(np.argmax(wrong))).error("is beyond the range of float32")

@@ -163,7 +163,7 @@ def _webp(pixels: Bytes) -> bytes:
 
 def _means(splats: Splats) -> tuple[Float, Float, NDArray[np.int64]]:
     """Return the bounds of the logarithms per axis, and (N, 3) 16-bit codes between them."""
-    means = splats.means.astype(np.float64)
+    means = splats.means.astype(float)
     logs = np.sign(means) * np.log1p(np.abs(means))
     low, high = logs.min(axis=0), logs.max(axis=0)
     return low, high, coded((logs - low) / np.where(high > low, high - low, 1.0), 65535)
@@ -178,7 +178,7 @@ def _numbers(values: Values) -> tuple[Float32, NDArray[np.intp]]:
 
 def nearest(book: Float32, values: Float32) -> NDArray[np.intp]:
     """Return the entry of an ascending codebook nearest to each value."""
-    wide = book.astype(np.float64)
+    wide = book.astype(float)
     return np.searchsorted((wide[1:] + wide[:-1]) / 2, values)
 
 
@@ -187,7 +187,7 @@ def _weights(splats: Splats) -> Float32:
 
     The root gains 0.35 dB over equal weights on a scene at 10×; α·A itself gains nothing.
     """
-    longer = longer_axes(splats.scales.astype(np.float64)).prod(axis=1)
+    longer = longer_axes(splats.scales.astype(float)).prod(axis=1)
     shown = np.sqrt(splats.opacities * np.minimum(longer, 1e30))
     mean = shown.mean()
     return (shown / mean if mean > 0 else np.ones(len(splats))).astype(np.float32)

@@ -54,7 +54,7 @@ class Stream(RawStream):
 def form_of(path: Path, splats: Splats) -> Splats:
     """Return a scene as a .splat holds it: y down, and relative to an offset if it is far from the origin."""
     form = as_packed(path, splats)
-    world = form.means.astype(np.float64) + form.offset
+    world = form.means.astype(float) + form.offset
     step = np.spacing(np.abs(world).max().astype(np.float32))
     far = np.abs(np.median(world, axis=0)).max() > FAR_FROM_ORIGIN
     if far or step > np.median(form.scales.min(axis=1)):
@@ -74,11 +74,11 @@ def write(path: Path, splats: Splats, *, overwrite: bool = False) -> float:
     It cannot state an `offset` or axes: see `form_of`. Return the largest change of a position by rounding.
     """
     form = form_of(path, splats)
-    exact = splats.means.astype(np.float64) + splats.offset
+    exact = splats.means.astype(float) + splats.offset
     again = restored(form, form.axes)
-    error = float(np.abs(again.means.astype(np.float64) + again.offset - exact).max())
+    error = float(np.abs(again.means.astype(float) + again.offset - exact).max())
     splats = form
-    weight = splats.scales.astype(np.float64).prod(1) * splats.opacities
+    weight = splats.scales.astype(float).prod(1) * splats.opacities
     splats = splats.take(np.argsort(-weight, kind="stable"))
     rows = np.empty(len(splats), _ROW)
     rows["mean"] = splats.means

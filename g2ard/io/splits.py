@@ -11,17 +11,18 @@ from g2ard.io.colmap import model_folder
 from g2ard.io.finding import usable
 from g2ard.io.jsonfile import read_json
 from g2ard.io.paths import content_hash, read_text, real_path
-from g2ard.io.types import Mask
+from g2ard.io.types import Mask, Splits
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.lenses import photo_of
+
+Views = str | Path | None
+"""File or folder of views, beside which files of splits may be; None without one."""
 
 HOLD_OUT = 8
 """Without a split file every 8th name is in the test split, as in Mip-NeRF 360's and INRIA's evaluations."""
 
 
-def split_mask(
-    views: str | Path | None, names: Sequence[str], which: str, *, stated: Sequence[str | None] = ()
-) -> Mask:
+def split_mask(views: Views, names: Sequence[str], which: str, *, stated: Splits = ()) -> Mask:
     """Return the mask of views in a split.
 
     Splits come from the views themselves, otherwise from a split.json beside them ({"train": [names], "test":
@@ -54,15 +55,13 @@ def split_mask(
     return masks[which]
 
 
-def states_splits(views: str | Path | None, stated: Sequence[str | None] = ()) -> bool:
+def states_splits(views: Views, stated: Splits = ()) -> bool:
     """Return whether splits are stated by views or by a split.json beside them, see `split_mask`."""
     read = _read_split, _read_apart
     return any(stated) or (views is not None and any(of(Path(views)) is not None for of in read))
 
 
-def splits_of(
-    views: str | Path | None, names: Sequence[str], stated: Sequence[str | None] = ()
-) -> tuple[str | None, ...]:
+def splits_of(views: Views, names: Sequence[str], stated: Splits = ()) -> tuple[str | None, ...]:
     """Return the split of each view by the rules of `split_mask`, or None, for writing it with the views.
 
     For a view in several splits, "test" comes before "train", and both before others by name.
@@ -75,14 +74,14 @@ def splits_of(
     return tuple(next((word for word in order if masks[word][i]), None) for i in range(len(names)))
 
 
-def for_training(views: str | Path | None, names: Sequence[str], stated: Sequence[str | None] = ()) -> Mask:
+def for_training(views: Views, names: Sequence[str], stated: Splits = ()) -> Mask:
     """Return the (C,) mask of views to train on when other views are scored: "train" if splits are stated,
     otherwise all. Arguments are those of `split_mask`.
     """
     return split_mask(views, names, "train" if states_splits(views, stated) else "all", stated=stated)
 
 
-def for_scores(views: str | Path | None, names: Sequence[str], stated: Sequence[str | None] = ()) -> Mask:
+def for_scores(views: Views, names: Sequence[str], stated: Splits = ()) -> Mask:
     """Return the (C,) mask of views to score on in a file for scoring: all except those stated as "train".
 
     Arguments are those of `split_mask`.
@@ -97,7 +96,7 @@ def for_scores(views: str | Path | None, names: Sequence[str], stated: Sequence[
     return mask
 
 
-def _masks(views: str | Path | None, names: Sequence[str], stated: Sequence[str | None]) -> dict[str, Mask]:
+def _masks(views: Views, names: Sequence[str], stated: Splits) -> dict[str, Mask]:
     """Return split → (C,) mask: as stated, as listed in split.json, or by the rule."""
     if any(stated):
         return {word: np.array([s == word for s in stated], bool) for word in {s for s in stated if s}}
@@ -179,7 +178,7 @@ def not_held_out(cameras: Cameras, held_out: Cameras) -> Mask:
     their pose."""
     alike = same_photos(cameras.image_paths, held_out.image_paths, copies=True)
     places = np.concatenate([cameras.positions, held_out.positions])
-    slack = _SAME_POSE * np.ptp(places, axis=0).max() + np.finfo(np.float64).eps * np.abs(places).max()
+    slack = _SAME_POSE * np.ptp(places, axis=0).max() + np.finfo(float).eps * np.abs(places).max()
     for place, turn in zip(held_out.positions, held_out.viewmats[:, :3, :3], strict=True):
         near = (np.abs(cameras.positions - place) <= slack).all(1)
         alike |= near & (np.abs(cameras.viewmats[:, :3, :3] - turn) <= _SAME_POSE).all((1, 2))

@@ -206,8 +206,8 @@ def _zstd_streams(data: bytes, stream_count: int, sizes: list[int]) -> list[byte
     except struct.error as error:
         raise damaged("truncated: the table of streams is cut off") from error
     streams, start = [], table + 16 * stream_count
-    for i, size in enumerate(sizes):
-        packed, unpacked = entries[i] if i < stream_count else (0, 0)
+    entries += [(0, 0)] * len(sizes)
+    for i, (size, (packed, unpacked)) in enumerate(zip(sizes, entries, strict=False)):
         if start + packed > len(data):
             raise damaged(f"truncated in stream {i}")
         stream = _unpacked(data[start : start + packed], size) if size == unpacked > 0 else b""
@@ -289,12 +289,12 @@ def write(
     error = packing.rounding(splats, splats.narrowed()) if len(splats) else 0.0
     splats = packing.as_packed(path, splats)
     own = packing.own_place(splats)
-    bits = fraction_bits(path, splats.means.astype(np.float64), splats)
+    bits = fraction_bits(path, splats.means.astype(float), splats)
     splats = replace(splats, offset=np.zeros(3))
     if axes != "RUB":
         splats = with_axes(splats, change_of_axes("RUB", "RDF") @ change_of_axes("RDF", axes))
     splats = splats.take(packing.packing_order(splats.means))
-    means = splats.means.astype(np.float64)
+    means = splats.means.astype(float)
     named: Axes = axes if spz_version == 4 else "RUB"
     if own and axes != named:
         own["stored"] = axes
@@ -307,7 +307,7 @@ def write(
 
 def rounding(means: Values, bits: int) -> float:
     """Return the largest change of a coordinate in `bits` fractional bits."""
-    scaled = np.asarray(means, np.float64) * (1 << bits)
+    scaled = np.asarray(means, float) * (1 << bits)
     return float(np.abs(np.rint(scaled) - scaled).max()) / (1 << bits)
 
 
@@ -383,7 +383,7 @@ def fraction_bits(path: Path, means: Float, splats: Splats, *, movable: bool = F
     farthest = float(reach.max())
     # 23 bits beside the sign; the margin keeps what is just below a power of two from rounding up to 2^23
     room = 23 - math.ceil(math.log2(max(farthest, 2.0**-20) * (1 + 2**-20)))
-    middle = np.sort(splats.scales, axis=1)[:, 1].astype(np.float64)
+    middle = np.sort(splats.scales, axis=1)[:, 1].astype(float)
     fine_scale = max(float(np.percentile(middle, 1)), 1e-12)
     bits_for_fine_scale = math.ceil(-math.log2(fine_scale / 4))
     bits = min(max(_USUAL_BITS, bits_for_fine_scale), _MOST_BITS, room)
@@ -399,7 +399,7 @@ def fraction_bits(path: Path, means: Float, splats: Splats, *, movable: bool = F
             path=path,
             hint="write another format",
         )
-    near = np.delete(splats.means, far, axis=0).astype(np.float64) + splats.offset
+    near = np.delete(splats.means, far, axis=0).astype(float) + splats.offset
     ends = [*np.floor(near.min(axis=0)), *np.ceil(near.max(axis=0))]
     raise InputError(
         f".spz is too coarse at {farthest:g} from the origin {steps}, where {plural(len(far), 'Gaussian')} "
@@ -416,14 +416,14 @@ def _streams(splats: Splats, means: Float, bits: int, version: int) -> list[byte
     signs = np.where(quats[:, :1] < 0, -1, 1)  # w ≥ 0
     streams = [
         fixed.reshape(-1, 1).view(np.uint8)[:, :3].tobytes(),
-        _bytes(splats.opacities.astype(np.float64) * 255),
-        _bytes((splats.sh0[:, 0].astype(np.float64) * _COLOR_SCALE + 0.5) * 255),
+        _bytes(splats.opacities.astype(float) * 255),
+        _bytes((splats.sh0[:, 0].astype(float) * _COLOR_SCALE + 0.5) * 255),
         _bytes((packing.log_scales(splats) + 10) * 16),
         _bytes(quats[:, 1:] * signs * 127.5 + 127.5) if version == 2 else _packed(quats),
     ]
     if splats.sh_degree:  # in all 8 bits: rounding to fewer is where other writers lose most
         flips = FLIPS[: splats.shN.shape[1], None]
-        streams.append(_bytes(splats.shN.astype(np.float64) * flips * 128 + 128))
+        streams.append(_bytes(splats.shN.astype(float) * flips * 128 + 128))
     return streams
 
 

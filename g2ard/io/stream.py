@@ -118,8 +118,11 @@ class SceneStream(Stream[Splats]):
             rows = raw.take(slice(kept, kept := kept + len(block)))
             rows.fill(getattr(block, name) for name in ARRAYS)
         self.all_notes()  # raises if no row is finite
-        splats = raw.take(slice(kept)).activated(self.render_model, self.offset, self.up)
-        return replace(splats, axes=self.axes)
+        return self.placed(raw.take(slice(kept)))
+
+    def placed(self, rows: Raw) -> Splats:
+        """Return activated rows as a scene that stands as this one does."""
+        return replace(rows.activated(self.render_model, self.offset, self.up), axes=self.axes)
 
 
 class RawStream(SceneStream):
@@ -127,8 +130,7 @@ class RawStream(SceneStream):
 
     def restore(self, axes: Axes) -> None:
         """Turn what the file holds, y down, to coordinates of these axes."""
-        whole = Raw.empty(0, 0).activated(self.render_model, self.offset, self.up)
-        found = restored(whole, axes)
+        found = restored(self.placed(Raw.empty(0, 0)), axes)
         self.axes, self.offset, self.up = axes, found.offset, found.up
 
     def in_axes(self, means: Float32) -> Float32:

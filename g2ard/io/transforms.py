@@ -2,7 +2,7 @@
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,7 @@ from g2ard.io.finding import Finder, is_end
 from g2ard.io.jsonfile import Json, Number, Place, Pose, Vector, Whole, checked, read_json
 from g2ard.io.paths import beside
 from g2ard.io.photos import Frame, Lens, Listed, fits, inverse, photo_size, rigid
-from g2ard.io.types import Float, Note, Notes, Size, ViewFiles
+from g2ard.io.types import Float, Note, Notes, Size, Splits, ViewFiles
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.lenses import PhotoLens
 
@@ -287,7 +287,7 @@ def _size(place: Place, frame: _Frame, photo: Path) -> Size:
     raise error.at(hint="{images=DIR} names the folder of photos that are elsewhere")
 
 
-def text_of(path: Path, cameras: Cameras, splits: Sequence[str | None]) -> str:
+def text_of(path: Path, cameras: Cameras, splits: Splits) -> str:
     """Return a transforms.json: world_from_camera in OpenGL axes, and lists of file names per split.
 
     Photos are relative to `path`; views without one are named `images/NAME`.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -43,6 +44,9 @@ class Note:
 Notes = tuple[Note, ...]
 Size = tuple[int, int]
 """Width and height in pixels."""
+
+Splits = Sequence[str | None]
+"""Split of each view, such as "train" or "test", or None."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -56,22 +56,22 @@ def lost_views(
 
     if format == "g2ard":
         return []
-    lost = []
+    inria, nerfstudio = format == "inria", format == "nerfstudio"
     middle = [[w / 2, h / 2] for w, h in zip(cameras.widths, cameras.heights, strict=True)]
     off = int((abs(cameras.Ks[:, :2, 2] - middle).max(axis=1) > _OFF_CENTRE).sum())
-    if format == "inria" and off:
-        lost.append(f"{plural(off, 'principal point')} beside the image's middle")
-    bent = cameras.distortions[:, slice(None) if format == "inria" else slice(4, None)].any(axis=1)
-    if format != "nerfstudio" and bent.any():
-        what = "lens distortion" if format == "inria" else "k3 of the lens distortion"
-        lost.append(f"{what} of {plural(int(bent.sum()), 'view')}")
-    if format != "nerfstudio" and any(word not in (None, "train") for word in splits):
-        lost.append("splits")
+    bent = int(cameras.distortions[:, 0 if inria else 4 :].any(axis=1).sum())
     photos = sum(lens is not None for lens in cameras.lenses)
-    lost += [f"photos of {plural(photos, 'view')} that other lenses took"] if photos else []
     kinds = sum(kind != USUAL for kind in cameras.kinds)
-    lost += [f"the kinds of {plural(kinds, 'view')}"] if kinds else []
-    return lost + (["sampling weights"] if weighted else [])
+    lost = [
+        (inria and off, f"{plural(off, 'principal point')} beside the image's middle"),
+        (inria and bent, f"lens distortion of {plural(bent, 'view')}"),
+        (format == "colmap" and bent, f"k3 of the lens distortion of {plural(bent, 'view')}"),
+        (not nerfstudio and not {*splits} <= {None, "train"}, "splits"),
+        (photos, f"photos of {plural(photos, 'view')} that other lenses took"),
+        (kinds, f"the kinds of {plural(kinds, 'view')}"),
+        (weighted, "sampling weights"),
+    ]
+    return [text for count, text in lost if count]
 
 
 def check_views_output(path: str | Path, overwrite: bool = False, format: ViewFormat | None = None) -> Path:
