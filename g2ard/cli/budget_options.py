@@ -137,8 +137,8 @@ BUDGETS: dict[str, tuple[Any, ...]] = {
     "fit": (
         str | None,
         typer.Option(
-            metavar="5MB|DEVICE",
-            help="Largest scene that fits a file size or a device: "
+            metavar="5MB|page:10MB|DEVICE",
+            help="Largest scene that fits the size of a file or of a page with it, or a device: "
             "quest3, visionpro, android, ios, mobile, web, desktop.",
         ),
     ),

@@ -209,8 +209,9 @@ class RunFolder:
             preview(self.path / _PICTURE, drawn, scenes)
         line = ""
         if self._run.config["page"]:
-            dense = None
-            if isinstance(source, Source) and not recover.from_points and job.plan is None:
+            dense, config = None, self._run.config
+            alone = not config["compare"] or str(config["fit"]).startswith("page:")
+            if not alone and isinstance(source, Source) and not recover.from_points and job.plan is None:
                 dense = source, job.prior
             seen = job.views.train.cameras if job.views.pool is None else best.cameras
             size = None

@@ -162,7 +162,7 @@ def say_views(run: Run, views: ViewsReport | None, chosen: bool) -> None:
 
 def say_fit(run: Run, source: Path, budget: Budget, name: str) -> None:
     """Say that a file already has the bytes of a budget; `name` is that of the output."""
-    if budget.bytes is None or not source.is_file() or source.stat().st_size > budget.bytes:
+    if budget.bytes is None or budget.of_page or not source.is_file() or source.stat().st_size > budget.bytes:
         return
     fits = f"{source.name} has {source.stat().st_size / 1e6:.2f} MB, which already fits {budget.fit}"
     ours = scene_format(name).suffix

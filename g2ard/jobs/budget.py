@@ -26,6 +26,8 @@ LAYERS = {"quest3": 67}
 The same page derives it.
 """
 
+_PAGE = "page:"
+"""Prefix of the bytes of a page with the scene."""
 _BYTES = re.compile(r"(\d+(?:\.\d+)?)\s*([kKmMgG])[bB]")
 _UNITS = {"k": 1e3, "m": 1e6, "g": 1e9}
 _COUNT = re.compile(r"(\d+(?:\.\d+)?)\s*([kKmM]?)")
@@ -56,8 +58,9 @@ class Budget(Settings):
         count: exact number.
         ratio: reduction factor, at least 1; keeps round(N/ratio), at least 1.
         share: share to keep, in (0, 1]; rounded up.
-        fit: as many as fit into a file of this size, such as 5MB or 800kB, or render smoothly on a device:
-            quest3, visionpro, android, ios, mobile, web or desktop.
+        fit: as many as fit into a file of this size, such as 5MB or 800kB, or into a viewer page with the
+            scene alone, such as page:10MB, or render smoothly on a device: quest3, visionpro, android, ios,
+            mobile, web or desktop.
         min_psnr: approximately the fewest that keep this PSNR (dB) against renders of the scene.
         min_ssim: approximately the fewest that keep this SSIM; with `min_psnr` both hold.
 
@@ -81,7 +84,7 @@ class Budget(Settings):
             raise InputError("expected exactly one kind of budget: count, ratio, fit, min_psnr or min_ssim")
         if self.fit is not None and self.fit.lower() not in DEVICES and not self.bytes:
             raise InputError(
-                f"expected bytes such as 5MB or 800kB, or {', '.join(DEVICES)}, got {self.fit!r}",
+                f"expected bytes such as 5MB or page:10MB, or {', '.join(DEVICES)}, got {self.fit!r}",
                 parameter="fit",
             )
 
@@ -92,9 +95,14 @@ class Budget(Settings):
 
     @property
     def bytes(self) -> int | None:
-        """File size of `fit` in bytes; None if `fit` names a device or is not given."""
-        match = _BYTES.fullmatch((self.fit or "").strip())
+        """Size of `fit` in bytes; None if `fit` names a device or is not given."""
+        match = _BYTES.fullmatch((self.fit or "").strip().removeprefix(_PAGE).strip())
         return None if match is None else round(float(match[1]) * _UNITS[match[2].lower()])
+
+    @property
+    def of_page(self) -> bool:
+        """Return whether the bytes are those of a page with the scene."""
+        return (self.fit or "").strip().startswith(_PAGE)
 
     @property
     def is_measured(self) -> bool:

@@ -35,6 +35,7 @@ from g2ard.stages.simplify import Pairs, Simplified, SimplifyConfig
 from g2ard.stages.simplify import simplify as merge
 from g2ard.stages.simplify.gaps import say_gaps
 from g2ard.system.cached import cached_property
+from g2ard.viewer.page import room_for_scene
 
 if TYPE_CHECKING:
     from g2ard.jobs.memory import TilePlan
@@ -169,11 +170,14 @@ class Reduction:
                 return merge(splats, count, method="fast").splats
             return whole(self(count).splats)  # in tiles, recovery starts from this one
 
-        if budget.bytes is not None:
+        size = budget.bytes
+        if size is not None and budget.of_page:
+            size, file = room_for_scene(size), "scene.sog"
+        if size is not None:
             if sh_degree is not None:
                 splats = splats.with_sh_degree(sh_degree)
             exact = self.plan is not None and scene_format(file).suffix == ".ply"
-            most = int(budget.bytes * _BYTES_SAFETY) if self.recovered and not exact else budget.bytes
+            most = int(size * _BYTES_SAFETY) if self.recovered and not exact else size
             found = count_for_bytes(splats, most, file, tried, None if self.plan is None else total)
         else:
             found = budget.of(total, name)
@@ -187,10 +191,10 @@ class Reduction:
                     f"{before:,}, {layers:.0f} at {found:,}"
                 )
         if budget.fit is not None:
-            fits = plural(found, "Gaussian") if budget.bytes is None else f"about {plural(found, 'Gaussian')}"
+            fits = plural(found, "Gaussian") if size is None else f"about {plural(found, 'Gaussian')}"
             all_fit = f"nothing to do, all {plural(found, 'Gaussian')} already fit"
             say(f"{budget.fit}: {all_fit if found == total else fits}")
-        return ResolvedBudget(found, budget.bytes, file)
+        return ResolvedBudget(found, size, file)
 
     def _resolved_for_quality(self, wanted: Quality, file: str) -> ResolvedBudget:
         """Find the count that keeps a quality in generated views, as read back from the format of `file`."""

@@ -85,6 +85,20 @@ def write_page(
     return size, tuple(map(len, packed))
 
 
+def room_for_scene(size: int) -> int:
+    """Return the bytes of .sog for which the page of a scene has at most `size` bytes.
+
+    >>> room_for_scene(10_000_000) // 1_000_000
+    6
+    """
+    room = (size - len(_page(["?" * 100], {}, []).encode()) - 1000) * 3 // 4
+    if room <= 0:
+        raise InputError(
+            f"{size:,} bytes are too few; the viewer takes {size - room * 4 // 3:,}", parameter="fit"
+        )
+    return room
+
+
 def write_stream_page(
     path: str | Path,
     title: str,

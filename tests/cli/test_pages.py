@@ -10,10 +10,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
+import g2ard
 from g2ard.config.choices import BLACK
 from helpers.calls import CALLS, write_inputs
-from helpers.commands import CommandLine, succeeds
+from helpers.commands import CommandLine, refused, succeeds
 from helpers.photos import photos_of
+from helpers.scenes import checkered_ball
 
 OTHER_WORDS = re.compile(r"\b(teacher|student|reference|original|recovered|distilled|prior)\b", re.I)
 """Words that nobody reads for the dense scene, the target or the result."""
@@ -135,6 +137,24 @@ def test_a_registration_shows_photos_and_renders(made: Path) -> None:
     rows = re.findall(r"<tr>(<td.*?)</tr>", page)
     for column in set(re.findall(r'data-column="([^"]+)"', page)):
         assert any(re.search(rf'data-column="{re.escape(column)}">[^<]', row) for row in rows)
+
+
+@pytest.mark.parametrize("options", ["--fit page:1.1MB", "-r 8 --no-compare"])
+def test_a_page_fits_its_bytes_and_holds_the_result_alone(
+    options: str, made: Path, tmp_path: Path, command_line: CommandLine
+) -> None:
+    g2ard.save(tmp_path / "ball.ply", checkered_ball(3000))
+    ask = ("distill", "ball.ply", *options.split(), "--views", made / "views.json", "--steps", 2, "-o", "run")
+    succeeds(command_line, tmp_path, *ask)
+    page = tmp_path / "run" / "view.html"
+    (label,) = Text(page).labels
+    assert label.startswith("result: run")
+    if "page" in options:
+        assert 1_080_000 < page.stat().st_size <= 1_100_000
+        refusal = refused(
+            command_line, tmp_path, *ask[:2], "--fit", "page:9kB", *ask[4:-1], "other", status=1
+        )
+        assert "--fit: 9,000 bytes are too few; the viewer takes 1,0" in refusal
 
 
 def test_one_view_is_rendered_to_a_picture(made: Path, command_line: CommandLine) -> None:

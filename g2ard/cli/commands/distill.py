@@ -73,6 +73,12 @@ def distill(
     page: Annotated[
         bool, typer.Option("--page/--no-page", help="Write view.html, a viewer page with the scene.")
     ] = True,
+    compare: Annotated[
+        bool,
+        typer.Option(
+            "--compare/--no-compare", help="Show a small dense scene beside the result in view.html."
+        ),
+    ] = True,
     resume: opt.ResumeOption = False,
     size: opt.SizeOption = None,
     background: opt.BackgroundOption = None,
