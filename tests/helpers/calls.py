@@ -155,6 +155,7 @@ VALUES: dict[str, dict[str, str]] = {
         "views_format": "inria",
         "clean": "",
         "page": "",
+        "compare": "",
         "focus": "far",
     },
     "simplify": {
@@ -243,6 +244,7 @@ VALUES: dict[str, dict[str, str]] = {
         "least": "1 --chunk-extent 0.5",
         "kind": "3dtiles",
         "place": "25,59,30",
+        "unit": "ft",
     },
     "evaluate": {
         **_common("views alpha convention size background render_model"),
@@ -292,6 +294,7 @@ ON: dict[str, dict[str, str]] = {
     "select": {"images": "select ball.ply --views sizeless.json -k 4 -o out.json"},
     "distill": {
         "views_format": "distill ball.ply -r 8 --steps 3 --size 24 --views made --no-page -o out",
+        "compare": "distill ball.ply -r 8 --steps 3 --size 24 --views photos.json --renders -o out",
     },
     "adapt": dict.fromkeys(("alpha", "images"), "adapt small.ply --views photos.json --steps 3 -o out.ply"),
     "convert": {
@@ -303,6 +306,8 @@ ON: dict[str, dict[str, str]] = {
         "images": "lod ball.ply -r 1,4 --views sizeless.json --steps 3 -o out",
         "steps": "lod ball.ply -r 1,4 --views photos.json --size 24 -o out",
         "place": "lod ball.ply -r 4,8 --views photos.json --size 24 --merge-only --format 3dtiles -o out",
+        "unit": "lod ball.ply -r 4,8 --views photos.json --size 24 --merge-only --format 3dtiles "
+        "--georeference 25,59,30 -o out",
     },
     "render": {
         "images": "render ball.ply --views sizeless.json -o out",
