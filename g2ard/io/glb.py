@@ -518,13 +518,12 @@ def _placements(path: Path, nodes: list[_Node], mesh: int, seen: set[int]) -> li
     for shown in (i for i in holders if i in seen):
         at: int | None = shown
         total, above = np.eye(4), set[int]()
-        while at is not None:
-            if at in above:
-                raise InputError(f"node {at} is its own ancestor")
-            above.add(at)
-            with np.errstate(over="ignore", invalid="ignore"):
-                total = _local(nodes[at]) @ total
-            at = parents.get(at)
+        with np.errstate(over="ignore", invalid="ignore"):
+            while at is not None:
+                if at in above:
+                    raise InputError(f"node {at} is its own ancestor")
+                above.add(at)
+                total, at = _local(nodes[at]) @ total, parents.get(at)
         if not np.isfinite(total[:3, 3]).all():
             raise InputError(f"invalid translation {tuple(total[:3, 3].tolist())}")
         found.append(total * np.outer((*_GLTF_TURN, 1), (*_GLTF_TURN, 1)))

@@ -24,18 +24,18 @@ class Stream(HeldPoints):
     """The points3D.bin or .txt itself, or that of the model in a COLMAP folder, in memory.
 
     Args:
-        images: names of the images that points may come from: those that fewer than two of them see are
-            skipped, except points that state no image. None of the model's images keeps all.
+        names: images that points may come from: those that fewer than two of them see are skipped, except
+            points that state no image. None of the model's images keeps all.
     """
 
-    def __init__(self, path: Path, images: Sequence[str] = ()) -> None:
+    def __init__(self, path: Path, names: Sequence[str] = ()) -> None:
         if path.is_dir() or path.stem.lower() != "points3d":
             file = points_file(path)
             if file is None or not file.is_file():
                 raise InputError("has no points3D.bin or points3D.txt", path=model_folder(path) or path)
             path = file
         with parsing(path):
-            numbers = numbers_of(path.parent, images) if images else set()
+            numbers = numbers_of(path.parent, names) if names else set()
             rows = (_binary if path.suffix.lower() == ".bin" else _text)(path, numbers)
         whole = (rows[:, 3:] == np.rint(rows[:, 3:])).all()
         super().__init__(path, rows[:, :3], rows[:, 3:], (255.0,) if whole else (1.0, 255.0))
@@ -71,10 +71,9 @@ def _text(path: Path, numbers: set[int]) -> Float:
         table = TextTable(path, "point")
         rows = np.array([table.take(_NUMBERS)[1:] for _ in table])
     inside = (rows[:, 3:] >= 0) & (rows[:, 3:] <= 255)
-    if not inside.all():
-        i, channel = (int(at) for at in np.argwhere(~inside)[0])
-        place, found = Place(path, i, "point", "RGB"[channel]), rows[i, 3 + channel]
-        raise place.error(f"is {found:g}, expected 0 to 255")
+    for i, channel in np.argwhere(~inside)[:1].tolist():
+        found = rows[i, 3 + channel]
+        raise Place(path, i, "point", "RGB"[channel]).error(f"is {found:g}, expected 0 to 255")
     return rows
 
 
