@@ -233,7 +233,7 @@ def _peak_bytes(job: Any, count: int, steps: int, page: bool) -> int:
     rows = 0 if job.plan else dense  # that view.html may show
     chosen = job.config.select.count_of(len(train))
     used = [train if chosen == "auto" else train.take(range(min(chosen, len(train))))] if steps else []
-    used += [part for part in (views.test, views.apart) if part is not None]
+    used += [part for part in (views.test, views.apart, views.twice) if part is not None]
     full = [] if views.full is None else [within_pixels(views.full)]
     targets = sum(_target_bytes(part, job.prior if job.renders else None) for part in (used, full))
     kept = _PROGRAM_BYTES + _sampled(_SURVEY, dense) + targets + _image_bytes([*used, *full]) + 2 * small
