@@ -248,6 +248,7 @@ class DistillJob:
             self.targets.train,
             self.config,
             weights=self.weights,
+            merging=self.views.merging,
             validation=self.targets.validation,
             work=work,
             progress=self.progress,
@@ -270,7 +271,7 @@ class DistillJob:
             return level, merged, job._score(merged, on), job._score(level, on)
         if self.recovers:
             self.say(f"{plural(count, 'Gaussian')} are too many for the memory to recover: merged only")
-        cameras, config = self.views.train.cameras, self.config.simplify
+        cameras, config = self.views.merging or self.views.train.cameras, self.config.simplify
         small = finer.merged(count, cameras, config, gaps=True, progress=self.progress)
         say_gaps(small.report.opacity_lost, self.say)
         derived = finer.derived(small.splats, "merged")

@@ -72,10 +72,11 @@ _POOL_GAUSSIANS = 4_000_000
 _POOL_SAMPLE = 200_000
 """Gaussians that poses are planned on."""
 
-_WEIGHT_VIEWS, _WEIGHT_ROWS, _WEIGHT_NEAR_SHARE = 96, 100_000, 0.25
-"""Size of the pool for simplification, of which as many are used as the scene needs, the Gaussians that it is
-planned on, and its share of nearer views where a view shows little.
-"""
+_WEIGHT_VIEWS, _WEIGHT_ROWS = 80, 100_000
+"""Usual views that weigh Gaussians, of which as many are used as the scene needs, and the Gaussians that they
+are planned on."""
+_WEIGHT_OTHERS = {"near": 8, "anywhere": 16}
+"""Views of other kinds beside these: usual ones may all stand outside a closed room (decision 0040)."""
 
 
 def views_of(
@@ -128,7 +129,7 @@ def views_of(
         share = 1.0
         if use != "merging":
             share = pool_share(options.config.recover, prior, planned.cameras)
-        return _generated(
+        views = _generated(
             planned,
             held_out,
             options.size,
@@ -142,6 +143,10 @@ def views_of(
             say,
             share=share,
         )
+        if use == "merging" or options.config.simplify.method == "paper":
+            return views
+        merging = cameras_for_weights(prior, asked, represents=represents, progress=progress)
+        return replace(views, merging=merging)
     train, test = given or split_views(found, options.held_out, say, unpictured=teach)
     if not are_found:
         check_sight(prior, train.cameras, say)
@@ -483,15 +488,16 @@ def cameras_for_weights(
         warn_of_sight(scene, cameras, say)
         return cameras
     try:
-        return _planned(
+        pool = _planned(
             scene,
             given,
             _WEIGHT_VIEWS,
             rows=_WEIGHT_ROWS,
-            near=_WEIGHT_NEAR_SHARE,
             represents=represents,
             progress=progress,
-        ).cameras
+        )
+        others = [camera for kind, count in _WEIGHT_OTHERS.items() for camera in pool.more(kind, count)]
+        return Cameras.of([*pool.cameras, *others])
     except InputError as e:
         say(f"continuing without views: {e}")
         return None

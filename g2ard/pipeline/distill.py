@@ -43,6 +43,8 @@ class RunViews:
         unseen: share of the sampled matter that no view of the pool sees.
         twice: a few of the usual views for scoring at twice their size, if they were generated.
         guess: how the up direction of generated views was guessed; None if it is more than a guess.
+        merging: generated views that weigh Gaussians while they are merged, as `simplify` plans them, because
+            those for training crowd where the compact scene is weak. None: the training views.
     """
 
     train: ViewSet
@@ -53,6 +55,7 @@ class RunViews:
     full: Cameras | None = None
     twice: Cameras | None = None
     guess: str | None = None
+    merging: Cameras | None = None
 
     def resized(self, longest: int) -> RunViews:
         """Shrink all views for training and scoring."""
@@ -106,6 +109,7 @@ def distill(
     config: DistillConfig | None = None,
     *,
     weights: ArrayLike | None = None,
+    merging: Cameras | None = None,
     validation: Targets | None = None,
     work: Path | None = None,
     progress: Progress = silent,
@@ -124,6 +128,7 @@ def distill(
         targets: photos, or the prior's own renders.
         config: see `DistillConfig`.
         weights: (C,) sampling weight of each view; None computes them.
+        merging: views that weigh Gaussians while they are merged; None takes those of `targets`.
         validation: views of another kind, not trained on, that limit recovery's changes if they lose quality,
             see `g2ard.stages.recover.recover`.
         work: folder for finished steps and checkpoints. The same call resumes from it, and one with other
@@ -157,7 +162,16 @@ def distill(
             selecting += time.monotonic() - began
         drawn = (chosen, validation) if budget < total else ()  # it may be its own teacher
         simplified, report, protected = _simplified(
-            steps, number, dense, count, budget, targets.cameras, config, protected, progress, drawn
+            steps,
+            number,
+            dense,
+            count,
+            budget,
+            targets.cameras if merging is None else merging,
+            config,
+            protected,
+            progress,
+            drawn,
         )
         scene, recoveries = simplified, []
         final = number == len(counts)

@@ -29,9 +29,9 @@ _FREE_GAUSSIAN_VIEWS = 6_000_000
 NEAR = 1e-3
 """Near plane as a fraction of the cameras' median distance from the scene's centre."""
 
-_OTHER_VIEWS, _OTHER_SHARE = 32, 0.1
+_OTHER_VIEWS, _OTHER_SHARE = 32, 0.05
 """Most views of other kinds than usual ones, and their weight relative to that of all usual views, because
-they show few Gaussians with many pixels each. Measured in decision 0034."""
+they show few Gaussians with many pixels each. Measured in decision 0040."""
 
 CONVERGED = 0.01
 """Sampling stops after a round whose share of newly seen Gaussians is below this."""
@@ -118,7 +118,7 @@ def visibility_source(cameras: Cameras, *, longest: int = LONGEST, progress: Pro
 
     Args:
         cameras: the views; at most 96 usual ones are used, evenly spaced, and at most 32 of other kinds,
-            which together weigh a tenth of the usual ones. Without usual views, all are equal.
+            which together weigh a twentieth of the usual ones. Without usual views, all are equal.
         longest: longer side of the renders, pixels; `pixel_size` refers to the full image.
 
     Returns:

@@ -40,7 +40,7 @@ def test_regularizer_rows_are_whole_and_not_measured_twice(scene: SceneSpec, tmp
 
 
 def test_curves_compare_schedules(scene: SceneSpec, tmp_path: Path) -> None:
-    found = ask(scene, tmp_path, "curves", methods="default", ratios="2", steps="50,200")
+    found = ask(scene, tmp_path, "curves", methods="default", ratios="10", steps="50,200")
     ends = [row for row in found if row["final"]]
     assert [row["variant"] for row in ends] == ["default@50", "default@200"]
     for end in ends:

@@ -74,7 +74,7 @@ def assert_shows(browser: Browser, expected: np.ndarray, decibels: float, index:
     """Check that a viewer draws an expected picture; return what it draws."""
     height, width = expected.shape[:2]
     picture = drawn(browser, like(expected, decibels), index, (width, height))
-    assert psnr(picture, expected) > decibels
+    assert psnr(picture, expected) > decibels, psnr(picture, expected)
     return picture
 
 

@@ -82,7 +82,7 @@ def test_the_environment(browser: Browser, site: tuple[Path, str], levels: tuple
     )
     streaming(folder, "sky", levels, FRONT, sky)
     show(browser, f"{address}/sky/")
-    assert_shows(browser, rendered(join([levels[0], sky])), 35)
+    assert_shows(browser, rendered(join([levels[0], sky])), 34)
 
 
 GLOBE = """<!doctype html><style>body { margin: 0; overflow: hidden }
