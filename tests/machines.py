@@ -1,4 +1,4 @@
-"""What a machine happens to have, and the tests that depend on it: each passes with and without.
+"""Traits of machines, and the tests that depend on them: each test passes with and without.
 
     python tests/machines.py list             # each trait, and whether this machine has it
     python tests/machines.py without [NAME…]  # the tests that depend on these, without any of them

@@ -1,4 +1,4 @@
-"""What a machine happens to have is listed in `machines.py`, which hides it from tests that depend on it."""
+"""Tests that `machines.py` lists all traits of machines and hides each from the tests that depend on it."""
 
 import json
 import re
@@ -22,7 +22,7 @@ TEXTS = {str(path.relative_to(ROOT)): path.read_text(encoding="utf-8") for path 
 DEVELOPERS = {"jedi", "packaging", "pty", "pyte", "torch"}
 """Modules that are there wherever the tests run, or that only the system decides on."""
 SWITCHES = {"G2ARD_REQUIRE_GPU", "G2ARD_SCENE", "G2ARD_COMPLETE", "G2ARD_NOWHERE"}
-"""Variables that ask for something, and tell of nothing that a machine has."""
+"""Variables that request something and describe no machine."""
 
 
 def _found(pattern: str) -> Iterator[tuple[str, str]]:

@@ -109,7 +109,7 @@ class RunFolder:
         return record
 
     def _lacking(self, record: Mapping[str, Any]) -> list[str]:
-        """Return the options of this command whose files a finished run was not asked for."""
+        """Return the options of this command whose files a finished run lacks."""
         then, now = record.get("config", {}), self._run.config
         asked = {
             "--keep": now["keep"] and not self._simplified.exists(),

@@ -17,7 +17,7 @@ _BESIDE = (".lax", ".lasx", ".copc", ".prj", ".wkt", ".xml", ".txt", ".md", ".pd
 
 
 def clouds_in(folder: Path) -> list[Path]:
-    """Return the clouds of a folder that holds nothing else, sorted by name; none of another folder."""
+    """Return the clouds of a folder of clouds alone, by name; an empty list for another folder."""
     files = [file for file in sorted(folder.iterdir()) if not file.name.startswith(".")]
     clouds = [file for file in files if file.suffix.lower() in SUFFIXES]
     others = [file for file in files if file.suffix.lower() not in (*SUFFIXES, *_BESIDE)]

@@ -36,7 +36,7 @@ _MISREAD_AS = ("cp437", "cp1252", "latin-1")
 
 _MASK_FOLDERS = ("masks", "mask")
 MOVING = "dynamic_mask_"
-"""How names of instant-ngp's masks begin, in which white is what moves."""
+"""Prefix of instant-ngp's masks, in which white marks what moves."""
 _MASKS_BESIDE = (
     *("{name}.mask", "{stem}.mask", "{name}_mask", "{stem}_mask", "{stem}-mask", "mask_{stem}"),
     *(MOVING + "{stem}", MOVING + "{name}"),

@@ -50,7 +50,7 @@ _SPZ_EXTENSIONS = (
 """The extension of an SPZ, and its earlier names: within the splats' extension, or beside or without it."""
 
 _SPLATS = re.compile(r"[A-Z]+_(gaussian_splat|spz)")
-"""How names of extensions for splats begin, also of earlier ones and of those that are not read."""
+"""Prefixes of the names of extensions for splats, including earlier and unsupported ones."""
 
 LINEAR_NOTE = Note("linear_colors", 1, "linear colours are taken as sRGB, so renders are too dark")
 _SPZ_VERSION = 3

@@ -299,7 +299,7 @@ _BITS = (8, 10, 12, 14)  # bits of colours that are stored in 16
 
 
 def _white(folder: Path, suffix: str, brightest: int) -> float:
-    """Return the value of 16 bits that means white: the most of so many bits that holds the photos."""
+    """Return the value of 16 bits that means white: the largest of the bits that the photos use."""
     top = _brightest(folder, suffix)
     return float(next((2**bits - 1 for bits in _BITS if 0 < top < 2**bits > brightest), 65535))
 

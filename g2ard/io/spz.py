@@ -112,7 +112,7 @@ def decoded(path: Path, data: bytes) -> Noted:
 
 
 class _Own(msgspec.Struct):
-    """What g2ard states: offset and axes of the scene, and those of the file if not of the definition."""
+    """Offset and axes of the scene, and the file's axes if they differ from the format's."""
 
     offset: Vector = (0.0, 0.0, 0.0)
     axes: Axes = "RDF"

@@ -1,4 +1,4 @@
-"""Where a scene was looked at from: each Gaussian votes for the places that show it at a pixel or more.
+"""Places from which a scene was looked at: each Gaussian votes for those that show it at a pixel or more.
 
 Trainers split Gaussians until they cover a pixel or two in the nearest photos, and scanned points are as fine
 as the scanner was near. So a Gaussian with a standard deviation σ was looked at from within σ·f, where f is

@@ -129,7 +129,7 @@ def visibility_source(cameras: Cameras, *, longest: int = LONGEST, progress: Pro
 
 
 def usual_and_others(cameras: Cameras) -> tuple[Cameras, Cameras]:
-    """Return the usual views, all if there are none, and those of other kinds that measure visibility."""
+    """Return the usual views, or all if no kind is usual, and those of other kinds."""
     every = np.arange(len(cameras))
     usual = np.array(rows_by_kind(cameras.kinds).get(USUAL, every))
     other = np.setdiff1d(every, usual)

@@ -252,7 +252,7 @@ def program() -> str:
 
 
 def _work(task: Task, threads: int, client: str) -> _Worker:
-    """Run a task in a worker that has the client's program; return what the worker tells of itself."""
+    """Run a task in a worker that has the client's program; return the worker's description."""
     host = platform.node()
     if program() != client:
         raise InputError(

@@ -1,4 +1,4 @@
-"""What --resume makes of a finished output: inputs are all that it read; what is asked for is written."""
+"""--resume of a finished output: inputs are all files that were read, and requested files are written."""
 
 import json
 from collections.abc import Callable

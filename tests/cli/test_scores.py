@@ -174,7 +174,7 @@ def test_every_score_has_its_size(runs: Path, command_line: CommandLine) -> None
 
 
 def test_a_size_that_harms_is_a_warning_with_the_way_out() -> None:
-    """A loss above 3 dB at the views' own size is told as one; a smaller one is not."""
+    """A loss above 3 dB at the views' own size is reported; a smaller one is not."""
     from g2ard.cli.run_result import told
 
     means = [

@@ -291,7 +291,7 @@ def test_intensities_are_grey_where_colors_are_missing_or_all_black(
 @pytest.mark.parametrize("strays", [0, 20])
 @pytest.mark.parametrize("suffix", STORED[:3])
 def test_the_range_of_colors_is_that_of_most(tmp_path: Path, suffix: str, strays: int, bits: int) -> None:
-    """Black points count for nothing in it, and are told."""
+    """Black points do not count, and a note reports them."""
     rng = np.random.default_rng(1)
     unit = rng.uniform(0.02, 1, (3000, 3))
     unit[100:1600] = 0

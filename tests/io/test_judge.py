@@ -1,4 +1,4 @@
-"""How scenes of .ply, .glb and USD store opacities, scales and colours is judged alike."""
+"""Tests that opacities, scales and colours of .ply, .glb and USD scenes are judged alike."""
 
 from pathlib import Path
 

@@ -66,7 +66,7 @@ def spread(splats: Splats) -> Any:
 
 
 def plain(path: Path) -> Splats:
-    """What another program reads: the file without what g2ard states in it."""
+    """Return the file as another program reads it, without g2ard's own statements."""
     data = path.read_bytes()
     if path.suffix == ".ply":
         for name in (b"g2ard axes", b"g2ard offset"):

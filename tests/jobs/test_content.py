@@ -1,4 +1,4 @@
-"""What people look at survives a reduction: a yard under a sky, and the lines of a sign."""
+"""Tests that a reduction keeps a yard under a sky and the lines of a sign."""
 
 from __future__ import annotations
 

@@ -132,7 +132,7 @@ LEARNERS: dict[str, Callable[[Path, Path | None], Any]] = {
     "simplify": lambda views, _: g2ard.simplify(BALL, count=90, views=views),
 }
 SPLIT_ALONE = ("recover", "simplify")
-"""Those that take no other views for scores."""
+"""Commands that take no other views for scores."""
 
 
 @pytest.mark.parametrize("split", SPLITS, ids=lambda split: split.__name__)

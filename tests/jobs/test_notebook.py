@@ -1,4 +1,4 @@
-"""What notebooks show: pages inline, and a line with a picture of scenes, views, targets and results."""
+"""Tests of notebooks: pages inline, and a line with a picture of scenes, views, targets and results."""
 
 import ast
 import base64
@@ -241,7 +241,7 @@ LENSES = {
 @pytest.mark.parametrize("moved", ["photo", "mask"])
 @pytest.mark.parametrize("lens", LENSES)
 def test_a_photo_or_mask_that_moved_is_named(lens: str, moved: str, tmp_path: Path) -> None:
-    """By whatever reads it, through every lens."""
+    """Every reader reports it, through every lens."""
     photo, mask = photo_file(tmp_path / "photo.png", (64, 48)), photo_file(tmp_path / "mask.png", (64, 48))
     views = replace(VIEWS, image_paths=(photo,) * 3, mask_paths=(mask,) * 3, **LENSES[lens])
     shown = g2ard.Photos(views)

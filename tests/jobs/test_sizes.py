@@ -85,7 +85,7 @@ def test_a_larger_size_holds_except_for_photos(
 def test_all_views_of_a_run_have_its_size(
     more: str, views: str, size: int, inputs: Path, tmp_path: Path, command_line: CommandLine
 ) -> None:
-    """Those that train and those that are scored, so that a run's score is that of its views."""
+    """Views that train and views that are scored have one size, so a run's score is that of its views."""
     folder = shutil.copytree(inputs, tmp_path / "there")
     g2ard.save_views(folder / "few.json", around(3, (48, 36), 2.5))
     words = [*COMMANDS["distill"].split(), "--views", views, *more.split(), "--size", size]

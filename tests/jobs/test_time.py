@@ -89,7 +89,7 @@ LIMITED = {
 def test_a_dry_run_plans_the_time_that_is_given(
     name: str, limit: int, folder: Path, command_line: CommandLine
 ) -> None:
-    """Its steps are as many as its seconds of recovery allow, and with --time all takes the time."""
+    """The seconds of recovery decide the number of steps, and with --time the whole run takes the time."""
     save(folder / "small.ply", checkered_ball(50))
 
     def planned(ask: str) -> tuple[dict[str, Any], float]:
@@ -107,7 +107,7 @@ def test_a_dry_run_plans_the_time_that_is_given(
 
 
 def test_recovery_is_expected_to_get_its_least_share(job: jobs.DistillJob) -> None:
-    """As it does, see `test_too_short_a_time_is_told`."""
+    """The run itself warns too, see `test_too_short_a_time_is_told`."""
     assert dict(cost_of(replace(job, time=0.5), 150).stages)["recover"] == pytest.approx(0.025)
 
 

@@ -208,7 +208,7 @@ def test_few_images_also_change_unseen_gaussians() -> None:
 
 
 def test_each_stretch_draws_views_in_another_order() -> None:
-    """With one seed, the views that a stretch leaves out would be left out of the beginning of all."""
+    """One seed for all stretches would omit the same views at the beginning of each."""
     seeds, ball = [], checkered_ball(40)
 
     def recover(name: str, scene: Splats, targets: object, how: RecoverConfig, **_: object) -> object:

@@ -79,7 +79,7 @@ def test_photos_that_agree_change_no_bit(monkeypatch: pytest.MonkeyPatch) -> Non
 
 
 def test_offsets_masks_and_alpha_are_respected() -> None:
-    """Of a photo only what its mask and its alpha show is fitted and corrected."""
+    """Only pixels that mask and alpha show are fitted and corrected."""
     alphas = [g2ard.render(BALL, view).alpha[..., None] for view in VIEWS]
     white = g2ard.Renderer(BALL, background=(1, 1, 1))
     gains, offsets = 0.6 + 0.03 * np.arange(12), 0.01 * np.arange(12) - 0.05
@@ -240,7 +240,7 @@ def test_pixels_at_the_ends_of_the_range_tell_no_exposure(tone: float) -> None:
 
 
 def test_background_beyond_a_photo_with_alpha_has_no_exposure() -> None:
-    """Where a scene shows white behind it everywhere, only its own light is dimmed."""
+    """On a white background, only the scene's own light is dimmed."""
     thin = replace(BALL, logit_opacities=np.full(len(BALL), -1.5, np.float32)).with_sh_degree(0)
     gains, white = np.array([0.5, 1.0] * 6), g2ard.Renderer(thin, background=(1, 1, 1))
     drawn, taken = [white.render(view) for view in VIEWS], []

@@ -629,7 +629,7 @@ def test_after_the_score_changes_the_best_scene_is_scored_anew() -> None:
 
 @pytest.mark.parametrize("known", [False, True])
 def test_exposures_that_are_found_change_all_scores(known: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Those that were known from the start change none."""
+    """Weights that are known from the start change nothing."""
     told: list[str] = []
     running = SimpleNamespace(
         exposures=np.ones((4, 3)) if known else None,

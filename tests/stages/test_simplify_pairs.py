@@ -199,7 +199,7 @@ def test_a_scene_is_put_in_order_once(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def _fitted(alphas: list[float], members: int, wanted: float, now: float) -> tuple[Splats, Splats]:
-    """Return round Gaussians but for a short axis, before and after a fit of their opacities."""
+    """Return Gaussians with one short axis, before and after a fit of their opacities."""
     alpha, count = np.array(alphas), len(alphas)
     before = Splats.create(
         np.eye(3)[:count],

@@ -37,7 +37,7 @@ _LOST = 0.7
 """PSNR in dB that tiles of some hundred Gaussians may cost."""
 
 UNCOUNTED = {".skipped.sh_bands"}
-"""What reports of tiles do not count."""
+"""Values that reports of tiles do not count."""
 
 
 def both(command_line: CommandLine, folder: Path, *call: object, output: str) -> list[dict[str, Any]]:

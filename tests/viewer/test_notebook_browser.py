@@ -16,7 +16,7 @@ NOTEBOOK = """<!doctype html><html><head><meta charset="utf-8"></head><body><mai
 <div style="height: 300px">cells before</div>
 <div class="output_html rendered_html output_subarea output_execute_result"><iframe width="100%" height="640"
  src="about:blank" frameborder="0" allowfullscreen {extras}></iframe></div></main></body></html>"""
-"""What nbconvert writes for the IFrame of a cell, partly in sight on every screen."""
+"""HTML that nbconvert writes for a cell's IFrame, partly in sight on every screen."""
 
 FRAME = "document.querySelector('iframe').contentWindow"
 

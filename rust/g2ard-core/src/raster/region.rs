@@ -142,7 +142,7 @@ impl Within for &DepthRanges {
     }
 }
 
-/// The most light that is left in a pixel that is still going and whose ray meets the box; 0 if there is none.
+/// The most light left in an unfinished pixel whose ray meets the box; 0 without such a pixel.
 pub fn light_on(
     region: &Region,
     camera: &Camera,

@@ -135,7 +135,7 @@ impl Rasterizer {
     }
 }
 
-/// A tile's pairs that may lie within a box, and the box's depths at its pixels; None if there are none.
+/// A tile's pairs that may lie within a box, and the box's depths at its pixels; None without pairs.
 pub(super) fn pairs_within<'a>(
     pairs: &'a [Pair],
     splats: &[Splat],
