@@ -438,4 +438,4 @@ def write_level_page(
     eye, target = (
         (TILE_OF_SCENE @ (frame.world(point) - offset)).tolist() for point in (start.position, start.target)
     )
-    return write_globe_page(page, title, eye=eye, target=target, fov=max(start.fov), background=behind)
+    return write_globe_page(page, title, eye=eye, target=target, fov=start.fov, background=behind)

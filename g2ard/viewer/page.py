@@ -130,14 +130,14 @@ def write_globe_page(
     *,
     eye: Sequence[float],
     target: Sequence[float],
-    fov: float,
+    fov: Sequence[float],
     background: Sequence[float] | None = BLACK,
 ) -> int:
     """Write a page that shows the tileset.json of its own folder with a CesiumJS named in its address.
 
-    The initial camera is in the axes of the tiles, its field of view along the window's longer side.
+    The initial camera is in the axes of the tiles, its fields of view in degrees, as in `Start`.
     """
-    view = {"eye": [float(x) for x in eye], "target": [float(x) for x in target], "fov": float(fov)}
+    view = {"eye": [float(x) for x in eye], "target": [float(x) for x in target], "fov": [float(x) for x in fov]}
     view["background"] = _colour(background)
     text = (_HERE / "globe.html").read_text(encoding="utf-8")
     text = text.replace("{generator}", f"g2ard {__version__}").replace("{title}", escape(title))

@@ -191,3 +191,25 @@ def test_a_globe_page_opens_at_the_view(
         browser.run("new Promise(done => setTimeout(done, 500))")
         found = psnr(browser.picture()[inside][None] / np.float32(255), expected[inside][None])
     assert found > 25
+
+
+def test_a_globe_page_shows_all_of_the_view_on_every_screen(
+    browser: Browser, site: tuple[Path, str], levels: tuple[Splats, ...]
+) -> None:
+    folder, address = site
+    name = "screens"
+    save_tileset(folder / name, levels[-1:], up=(0, 0, 1))
+    (folder / name / "cesium").symlink_to(package("cesium", "Build", "Cesium"))
+    write_level_page(folder / name, levels[-1:], "3dtiles", GivenViews(Cameras.of([FRONT]), None, (0, 0, 1)))
+    assert told(browser, f"{address}/{name}/?cesium=cesium") == ""
+    view = json.loads(browser.run("JSON.stringify(g2ard.view.fov)"))
+    need = np.tan(np.radians(view) / 2)
+    for width, height in ((1280, 800), (1920, 1080), (390, 844)):
+        sizes = {"innerWidth": width, "innerHeight": height}
+        given = json.dumps({key: {"value": value, "configurable": True} for key, value in sizes.items()})
+        browser.run(f"Object.defineProperties(window, {given}), dispatchEvent(new Event('resize')), ''")
+        half = np.tan(browser.run("g2ard.ready.then(({ widget }) => widget.camera.frustum.fov)") / 2)
+        longer = max(width, height)
+        inside = half * np.array([width, height]) / longer
+        assert (inside >= need * (1 - 1e-6)).all()
+        assert np.isclose(inside, need).any()
