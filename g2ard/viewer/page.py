@@ -137,7 +137,11 @@ def write_globe_page(
 
     The initial camera is in the axes of the tiles, its fields of view in degrees, as in `Start`.
     """
-    view = {"eye": [float(x) for x in eye], "target": [float(x) for x in target], "fov": [float(x) for x in fov]}
+    view = {
+        "eye": [float(x) for x in eye],
+        "target": [float(x) for x in target],
+        "fov": [float(x) for x in fov],
+    }
     view["background"] = _colour(background)
     text = (_HERE / "globe.html").read_text(encoding="utf-8")
     text = text.replace("{generator}", f"g2ard {__version__}").replace("{title}", escape(title))
