@@ -182,10 +182,13 @@ def say_weight(run: Run, source: Path, output: Path, splats: Splats, *, lifted: 
     given, what = min(inputs, default=(made + 1, ""))
     if made < given:
         return
-    why = "packed formats are smaller than .ply"
+    why = ""
     if share := splats.shN.nbytes / splats.nbytes:
-        why = f"{share:.0%} of it is SH above degree 0; --sh-degree 0 removes it"
-    run.say(f"{output}: {made / 1e6:.2f} MB, {what} {given / 1e6:.2f} MB: {why}")
+        why = f"; {share:.0%} of it is SH above degree 0, which --sh-degree 0 removes"
+    smaller = (
+        "" if output.suffix == ".sog" else f"; smaller: g2ard convert {output} {output.with_suffix('.sog')}"
+    )
+    run.say(f"{output}: {made / 1e6:.2f} MB, {what} {given / 1e6:.2f} MB{why}{smaller}")
 
 
 def tell_quality(run: Run, budget: ResolvedBudget, splats: Splats) -> None:

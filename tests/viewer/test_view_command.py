@@ -9,7 +9,8 @@ from urllib.request import urlopen
 import pytest
 
 import g2ard
-from helpers.commands import CommandLine, program, refused
+from helpers.commands import CommandLine, program, refused, succeeds
+from helpers.photos import cloud_of
 from helpers.scenes import around, checkered_ball
 
 BALL = checkered_ball(200)
@@ -63,3 +64,16 @@ def test_a_page_is_served_until_ctrl_c(folder: Path, path: str, words: list[str]
 @pytest.mark.parametrize("words", ["levels ball.ply", "levels --views made"])
 def test_levels_are_shown_alone(words: str, folder: Path, command_line: CommandLine) -> None:
     refused(command_line, folder, "view", *words.split())
+
+
+@pytest.mark.parametrize("shown", ["run", "run/scene.ply"])
+def test_a_result_of_a_cloud_has_a_sky(shown: str, folder: Path, command_line: CommandLine) -> None:
+    """As in its run's view.html: gaps between points are not black."""
+    words = ("view", shown, "-o", "page.html", "-w")
+    succeeds(command_line, folder, *words)
+    assert '"background": [' in (folder / "page.html").read_text()
+    cloud_of(folder / "cloud.ply", BALL)
+    file = folder / "run" / "report.json"
+    file.write_text(file.read_text().replace("ball.ply", "cloud.ply"))
+    succeeds(command_line, folder, *words)
+    assert '"background": null' in (folder / "page.html").read_text()

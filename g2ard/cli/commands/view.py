@@ -86,6 +86,14 @@ def _dense_of(path: Path) -> Path | None:
     return dense if Source(dense).count <= _LARGEST_DENSE else None
 
 
+def _is_of_points(path: Path) -> bool:
+    """Return whether a scene is a run's result that was made of a point cloud, or its scene file."""
+    from g2ard.jobs.comparison import source_of
+
+    dense = source_of(path if path.is_dir() else path.parent)
+    return dense is not None and dense.exists() and Source(dense).kind == "points"
+
+
 def _write(
     run: Run,
     scene: Path,
@@ -113,12 +121,13 @@ def _write(
         views = own if any(read_views(own).image_paths) else "made"  # generated ones show what trains
     stand = frame_of(loaded[0], GivenViews(views, sources[0].file, up), start=start, say=run.say)
     labels = labels_of(sources, [len(splats) for splats in loaded], roles)
+    known = opt.background_of(run, background, scene, other)
     run.begin("page")
     written, scene_sizes = write_page(
         output,
         [(label, stand.of(splats)) for label, splats in zip(labels, loaded, strict=True)],
         start=stand.start,
-        background=backdrop(opt.background_of(run, background, scene, other), loaded),
+        background=None if known is None and _is_of_points(scene) else backdrop(known, loaded),
         overwrite=run.overwrite,
         progress=run.progress,
     )
