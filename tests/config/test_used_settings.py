@@ -23,6 +23,7 @@ from g2ard.jobs.inputs import GivenViews
 from g2ard.jobs.simplify import reducing
 from g2ard.jobs.tile_options import Tiling, needs_whole, refuse_whole
 from g2ard.pipeline.adapt import appearance_only
+from g2ard.pipeline.dense import whole
 from g2ard.pipeline.presets import configured
 from g2ard.scene.splats import SH_C0
 from g2ard.stages.lift import LiftConfig
@@ -248,7 +249,7 @@ def _simplified_in_tiles(settings: Mapping[str, Any]) -> object:
     config = configured(g2ard.SimplifyConfig(), settings=settings)
     refuse_whole(Source(scene), needs_whole(config))
     with reducing(Source(scene), tiling, given=GivenViews(UNEVEN), config=config) as reduce:
-        return reduce(BUDGET).splats.whole().fingerprint()
+        return whole(reduce(BUDGET).splats).fingerprint()
 
 
 def _distilled_in_tiles(settings: Mapping[str, Any]) -> object:
