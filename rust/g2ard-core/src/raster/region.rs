@@ -242,8 +242,9 @@ mod tests {
     use super::*;
     use crate::random::Lcg;
 
-    /// Cuts a box at one place of one axis.
+    /// Cuts a box at one place of one axis, or as near to it as the box reaches.
     fn cut(region: Region, axis: usize, at: f64) -> [Region; 2] {
+        let at = at.clamp(region.low[axis], region.high[axis]);
         let (mut below, mut above) = (region, region);
         below.high[axis] = at;
         above.low[axis] = at;
@@ -270,10 +271,11 @@ mod tests {
             let mut position = [0; 3].map(|_| random.between(-1.0, 1.0));
             let mut direction = [0; 3].map(|_| random.between(-1.0, 1.0));
             let (axis, at) = cuts[round % cuts.len()];
-            match round % 3 {
-                0 => position[axis] = at,
-                1 => direction[axis] = 0.0,
-                _ => {}
+            if round % 2 == 0 {
+                position[axis] = at;
+            }
+            if round % 3 == 0 {
+                direction[axis] = 0.0;
             }
             // Depths at random, and those of the faces with their neighbours.
             let mut depths: Vec<f32> = (0..50).map(|_| random.uniform_f32() * 2.0 + 0.01).collect();
