@@ -240,6 +240,18 @@ def test_light_on_hidden_boxes_is_less_than_faint() -> None:
     assert Canvas.blank(view).light_on(aside) == 0
 
 
+def test_medians_alone_are_those_beside_depths() -> None:
+    splats, tree, view = wall_and_ball()
+    beside = Canvas.blank(view, depths=True)
+    alone = replace(Canvas.blank(view, depths=True), depth=None)
+    for box in tree.boxes():
+        for canvas in (beside, alone):
+            canvas.draw(Renderer(splats), box)
+    assert beside.median is not None
+    assert beside.median.any()
+    np.testing.assert_array_equal(alone.median, beside.median)
+
+
 def test_boxes_give_the_same_bits_on_any_number_of_threads() -> None:
     splats = splats_of(scene(2, 3000, 1, size=0.05))
     tree = cut(splats, 5)

@@ -6,7 +6,7 @@ use super::frustum::Frustum;
 pub const GROUPS: usize = if cfg!(miri) { 1 } else { 16 };
 
 /// Bounds of some rows, stored apart from their values because a view reads the bounds of all groups.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Bounds {
     /// Centre of the means' box.
     centre: [f32; 3],

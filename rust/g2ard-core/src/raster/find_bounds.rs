@@ -74,3 +74,30 @@ fn values<F: Lanes>(lanes: F) -> [f32; LANES] {
     lanes.store(&mut row);
     row.0
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::raster::small::Small;
+
+    #[test]
+    fn bounds_hold_the_means_and_the_largest_scale_of_any_axis() {
+        let scene = Small::new();
+        for axis in 0..3 {
+            let params = scene.params();
+            let mut log_scales = params.log_scales.to_vec();
+            log_scales[3 * 20 + axis] = 0.0;
+            let first = Params {
+                log_scales: &log_scales,
+                ..params
+            }
+            .find_bounds()[0];
+            let rows = &params.means.as_chunks::<3>().0[..(LANES * GROUPS).min(params.len())];
+            let ends = |of: fn(f32, f32) -> f32, from: f32| {
+                [0, 1, 2].map(|k| rows.iter().fold(from, |end, mean| of(end, mean[k])))
+            };
+            let (low, high) = (ends(f32::min, f32::MAX), ends(f32::max, f32::MIN));
+            assert_eq!(first, Bounds::of_box(low, high, 1.0));
+        }
+    }
+}

@@ -439,7 +439,7 @@ mod tests {
             let mut n = Node {
                 mean: [0, 1, 2].map(|_| (2.0 * next()) as f32),
                 cov: covariance(&r, scales).map(|v| v as f32),
-                blur: 0.1,
+                blur: (0.15 + 0.2 * next()) as f32,
                 alpha: (next() + 0.5) as f32,
                 ..Node::default()
             }

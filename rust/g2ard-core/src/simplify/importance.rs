@@ -406,4 +406,25 @@ mod tests {
         }
         assert_eq!(measured(&[]), Importance::default());
     }
+
+    #[test]
+    fn a_spread_of_sizes_as_they_look_counts_nearly_by_number() {
+        let by = measured(&line(500, receding, |i| scattered(i) * receding(i)));
+        assert_eq!((by.exponent, by.angular), (LEAST, 1.0));
+    }
+
+    #[test]
+    fn distances_where_people_walk_about_do_not_tell_how_sizes_grow() {
+        // A fifth lies ever closer to the origin, all of one size; beyond, sizes grow with the distance.
+        let at = |i: usize| (i as f32 - 100.0) / if i < 100 { 8.0 } else { 60.0 };
+        let nodes = line(500, |i| at(i).exp(), |i| 0.01 * at(i).max(0.0).exp());
+        assert_eq!(measured(&nodes).angular, 1.0);
+    }
+
+    #[test]
+    fn people_do_not_stand_where_a_few_rows_coincide() {
+        let at = |i: usize| if i % 20 == 7 { 1500.0 } else { evenly(i) };
+        let by = measured(&line(500, at, |_| 0.1));
+        assert!(by.place[0] <= 500.0, "{by:?}");
+    }
 }

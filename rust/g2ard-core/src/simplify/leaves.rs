@@ -236,3 +236,70 @@ fn typical_size(scene: &SceneRef) -> f64 {
         .collect();
     power_of_two_below(f64::from(median(positive).unwrap_or(1.0)))
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::scene::Means;
+
+    const ROWS: usize = 300;
+
+    #[test]
+    fn unseen_rows_weigh_a_share_of_how_large_they_look_in_the_whole_and_in_a_tile() {
+        // Sizes grow with the distance from where people stand.
+        let at = |i: usize| (i as f32 / 40.0).exp();
+        let means: Vec<[f32; 3]> = (0..ROWS).map(|i| [at(i), 0.0, 0.0]).collect();
+        let scales: Vec<[f32; 3]> = (0..ROWS).map(|i| [0.02 * at(i); 3]).collect();
+        let scene = |rows: usize| SceneRef {
+            means: Means::F32(&means[rows..]),
+            quats: &[[1.0, 0.0, 0.0, 0.0]; ROWS][rows..],
+            scales: &scales[rows..],
+            logit_opacities: &[0.5; ROWS][rows..],
+            sh0: &means[rows..],
+            sh_rest: &[],
+            rest: 0,
+        };
+        let weight: Vec<f32> = (0..ROWS).map(|i| (i % 3) as f32).collect();
+        // Rows from `first` on: the Σ αT² of each, by input row.
+        let weighed = |first: usize, seen: bool, frame: Option<&Frame>| {
+            let scene = scene(first);
+            let ordered = Ordered::new(&scene).unwrap();
+            let pixel_size = [0.01; ROWS];
+            let visibility = seen.then_some(Visibility {
+                weight: &weight[first..],
+                pixel_size: &pixel_size[first..],
+            });
+            let (blur, every) = ([1e-5; ROWS], (0..scene.len() as u32).collect());
+            let leaves = Leaves::new(&scene, &ordered, every, &blur, visibility, frame);
+            let (mut weights, mut looks) = (vec![0.0; ROWS], vec![0.0; ROWS]);
+            for (i, &row) in ordered.rows.iter().enumerate() {
+                let node = leaves.node(i);
+                weights[first + row as usize] = node.visibility;
+                looks[first + row as usize] = leaves.importance.apparent(node.mean, node.mass);
+            }
+            let frame = Frame {
+                unit: leaves.unit,
+                pixel_size: 0.01,
+                floor: leaves.floor,
+                importance: leaves.importance(),
+            };
+            (weights, looks, frame)
+        };
+        let alike =
+            |got: f32, want: f32| assert!((got - want).abs() <= 1e-3 * want, "{got} {want}");
+        for seen in [true, false] {
+            let (weights, looks, frame) = weighed(0, seen, None);
+            assert_eq!(frame.importance.angular, 1.0);
+            if seen {
+                let floor = UNSEEN * weight.iter().sum::<f32>() / looks.iter().sum::<f32>();
+                for i in 0..ROWS {
+                    alike(weights[i], weight[i] + floor * looks[i]);
+                }
+            }
+            let (of_tile, ..) = weighed(100, seen, Some(&frame));
+            for i in 100..ROWS {
+                alike(of_tile[i], weights[i]);
+            }
+        }
+    }
+}

@@ -252,6 +252,30 @@ mod tests {
         assert_eq!(longest_of(8, 8), Some(8));
         // The count comes first.
         assert!(longest_of(7, 8) > Some(8));
+        assert_eq!(longest_of(4, 8), Some(16));
         assert_eq!(longest_of(1, 8), Some(64));
+    }
+
+    #[test]
+    fn four_rows_cost_twice_the_sum_of_their_merges() {
+        let mut rows = nodes(4);
+        for (i, node) in rows.geometry.iter_mut().enumerate() {
+            node.alpha = [0.1, 0.4, 0.3, 0.9][i];
+            *node = node.weighed();
+            node.visibility = 1.0 + i as f32;
+        }
+        rows.sh = (0..12).map(|i| (i * i % 7) as f32 / 7.0).collect();
+        let merge = |(a, p): (Node, [f32; 3]), (b, q): (Node, [f32; 3])| {
+            let (m, share) = (a.merged(&b), b.mass / (a.mass + b.mass));
+            let color = [0, 1, 2].map(|k| p[k] * (1.0 - share) + q[k] * share);
+            (a.cost(&b, color_distance(&p, &q), WEIGHTS), (m, color))
+        };
+        let row = |i: usize| (rows.node(i), rows.color(i));
+        let ((first, left), (last, right)) = (merge(row(0), row(1)), merge(row(2), row(3)));
+        let sum = first + last + merge(left, right).0;
+        let want = [first * 2f32.sqrt(), 2.0 * sum, last * 2f32.sqrt()];
+        for (got, want) in costs_of(&[0, 1, 2, 3], &rows).into_iter().zip(want) {
+            assert!((got - want).abs() < 1e-5 * want, "{got} {want}");
+        }
     }
 }

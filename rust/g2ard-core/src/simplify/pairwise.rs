@@ -666,4 +666,30 @@ mod tests {
             assert_eq!(costs(times * frame.unit), usual, "{times}");
         }
     }
+
+    #[test]
+    fn without_views_no_pixel_weighs_edges_and_geometry_weighs_half() {
+        let policy = Pairwise::default();
+        let seen = Visibility {
+            weight: &[1.0; ROWS],
+            pixel_size: &[0.01; ROWS],
+        };
+        let want = |geometric: f64, edge: f64| Weights {
+            geometric: geometric as f32,
+            edge: edge as f32,
+        };
+        assert_eq!(policy.weights(None), want(0.03 / 2.0, 0.0));
+        assert_eq!(policy.weights(Some(seen)), want(0.03, 0.5 / (0.4 * 0.4)));
+        let antialiased = Pairwise {
+            dilation: 0.0,
+            ..policy
+        };
+        assert_eq!(antialiased.weights(Some(seen)), want(0.03, 0.0));
+    }
+
+    #[test]
+    fn the_longest_run_is_a_multiple_of_the_mean_and_at_least_a_pair() {
+        assert_eq!(longest(6.0, 10.0), 60);
+        assert_eq!(longest(1.0, 1.5), 2);
+    }
 }

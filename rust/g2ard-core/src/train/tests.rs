@@ -1,4 +1,5 @@
 use super::*;
+use crate::raster::find_bounds::bounds_of;
 use crate::raster::frustum::Frustum;
 use crate::raster::params::Source;
 use crate::raster::rasterizer::ChunkSums;
@@ -180,6 +181,7 @@ fn rows_out_of_view_are_skipped_without_a_trace() {
         shown += culled.1.len();
         let frustum = Frustum::of(&next);
         let bounds = parameters.bounds().unwrap();
+        assert_eq!(bounds, bounds_of(&parameters.unbounded()), "step {step}");
         skipped += bounds
             .iter()
             .filter(|b| b.tile_rows(&frustum).is_none())
@@ -189,4 +191,53 @@ fn rows_out_of_view_are_skipped_without_a_trace() {
         cfg!(miri) || (skipped > 12 && shown > 12),
         "{skipped} bounds skipped, {shown} chunks shown"
     );
+    let mut resumed = Store::new(&scene.params(), None).unwrap();
+    let state = trainer.store.export();
+    resumed.import(&state).unwrap();
+    assert_eq!(Some(resumed.most_steps()), state.steps.into_iter().max());
+    let bounds = |store: &Store| store.parameters().bounds().unwrap().to_vec();
+    assert_eq!(bounds(&resumed), bounds(&trainer.store));
+}
+
+#[test]
+fn anchors_pull_rows_out_of_view_too() {
+    let (scene, shape) = (Small::new(), corner(0));
+    let params = scene.params();
+    let target = noise(3 * shape.width * shape.height, 9);
+    let mut trainer = Trainer::new(&params, None, Isa::detect()).unwrap();
+    // Every row lies outside the region of its anchor.
+    let rows = params.logit_opacities.len();
+    let away: Vec<f32> = params.means.iter().map(|v| v + 1.0).collect();
+    let frames = [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0].repeat(rows);
+    let radii = vec![0.5; rows];
+    trainer.set_anchors(&away, &frames, &radii, &radii).unwrap();
+    let before = trainer.store.columns(0, 3);
+    let input = StepInput {
+        camera: &shape,
+        settings: Settings::default(),
+        background: [0.0; 3],
+        target: &target,
+        mask: None,
+        view: None,
+        ssim_weight: 0.2,
+        relative: None,
+        rates: Rates {
+            means: 1e-3,
+            ..Rates::default()
+        },
+        reach: None,
+        finest: 0.0,
+        regularizers: Some(Regularizers {
+            anchor: 1.0,
+            ..Regularizers::default()
+        }),
+    };
+    let frustum = Frustum::of(&shape);
+    let parameters = trainer.store.parameters();
+    let bounds = parameters.bounds().unwrap();
+    assert!(cfg!(miri) || bounds.iter().any(|b| b.tile_rows(&frustum).is_none()));
+    trainer.step(&input).unwrap();
+    let after = trainer.store.columns(0, 3);
+    let moved = before.iter().zip(&after).filter(|(a, b)| a != b).count();
+    assert_eq!(moved, 3 * rows);
 }

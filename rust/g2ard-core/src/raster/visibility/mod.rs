@@ -423,4 +423,40 @@ mod tests {
         }
         assert_eq!(whole.by_row(), split.by_row());
     }
+
+    #[test]
+    fn boxes_lie_in_the_coordinates_of_the_scene() {
+        let rows = scene();
+        // The rows nearer than `face`, with everything `away` from where the test has it.
+        let nearer = |means: Means, away: f64| {
+            let mut camera = cameras()[0];
+            camera.viewmat = [0, 1, 2].map(|k| {
+                let mut row = [0.0, 0.0, 0.0, [0.1, -0.2, 3.0][k] - away];
+                row[k] = 1.0;
+                row
+            });
+            let region = Region {
+                low: [f64::NEG_INFINITY; 3],
+                high: [f64::INFINITY, f64::INFINITY, away + 0.3],
+            };
+            let scene = SceneRef {
+                means,
+                ..made(&rows)
+            };
+            let (mut sums, mut light) = (accumulator(&scene), vec![1.0; 85 * 64]);
+            sums.add_box(&camera, &Settings::default(), &region, &mut light)
+                .unwrap();
+            (sums.by_row().0, light)
+        };
+        let far: Vec<[f64; 3]> = rows
+            .0
+            .iter()
+            .map(|m| m.map(|v| f64::from(v) + 1e3))
+            .collect();
+        let (want, light) = nearer(Means::F32(&rows.0), 0.0);
+        let (got, light_far) = nearer(Means::F64(&far), 1e3);
+        assert!(want.iter().filter(|w| **w > 0.0).count() > 100 && light != vec![1.0; 85 * 64]);
+        let alike = |(a, b): (&f32, &f32)| (a - b).abs() < 1e-2 + 1e-3 * b;
+        assert!(got.iter().zip(&want).all(alike) && light_far.iter().zip(&light).all(alike));
+    }
 }
