@@ -141,8 +141,8 @@ def write_globe_page(
         "eye": [float(x) for x in eye],
         "target": [float(x) for x in target],
         "fov": [float(x) for x in fov],
+        "background": _colour(background),
     }
-    view["background"] = _colour(background)
     text = (_HERE / "globe.html").read_text(encoding="utf-8")
     text = text.replace("{generator}", f"g2ard {__version__}").replace("{title}", escape(title))
     return _write(Path(path), text.replace("{view}", json.dumps(view)), overwrite=True)
