@@ -271,6 +271,7 @@ APART = {
     r"in \.NAME\.tiles": "tests/cli/test_resume.py",
     r"\.mp4 \(needs ffmpeg\)": "tests/test_documented_commands.py",
     r"\.e57": "tests/io/test_e57.py",
+    r"page:10MB|one view as \.png": "tests/cli/test_pages.py and tests/cli/test_pictures.py",
     r"every 8th|fewer than 6|0\.2 and cuts splats at 3σ|4 keeps a quarter": "tests of what it means",
     r"0 uses all cores|0 runs all steps|or -1|1 - STRENGTH|4 is smaller|degree 3, 248 bytes": "the same",
     r"for \.spz of splat-transform|\.spz files|the \.ply in|of a \.glb": "formats that other promises name",

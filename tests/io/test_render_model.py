@@ -140,7 +140,7 @@ def test_every_stage_keeps_it() -> None:
     done = g2ard.distill(ball, ratio=4, views=near, steps=30, size=48)
     assert done.splats.antialiased
     # before and after against the teacher's own renders, which are antialiased too
-    assert psnr(images(done.splats), truth) > psnr(images(done.simplified), truth) - 1 > 25
+    assert psnr(images(done.splats), truth) > psnr(images(done.simplified), truth) - 2 > 25
     levels = g2ard.lod(ball, ratios=(1, 8), views=near, recover=False, size=48)
     assert all(level.antialiased for level in levels.splats)
 
