@@ -240,7 +240,7 @@ def test_pixels_at_the_ends_of_the_range_tell_no_exposure(tone: float) -> None:
 
 
 def test_background_beyond_a_photo_with_alpha_has_no_exposure() -> None:
-    """On a white background, only the scene's own light is dimmed."""
+    """Dim only the scene's own light on a white background."""
     thin = replace(BALL, logit_opacities=np.full(len(BALL), -1.5, np.float32)).with_sh_degree(0)
     gains, white = np.array([0.5, 1.0] * 6), g2ard.Renderer(thin, background=(1, 1, 1))
     drawn, taken = [white.render(view) for view in VIEWS], []

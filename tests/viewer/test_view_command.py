@@ -68,7 +68,7 @@ def test_levels_are_shown_alone(words: str, folder: Path, command_line: CommandL
 
 @pytest.mark.parametrize("shown", ["run", "run/scene.ply"])
 def test_a_result_of_a_cloud_has_a_sky(shown: str, folder: Path, command_line: CommandLine) -> None:
-    """As in its run's view.html: gaps between points are not black."""
+    """Show a sky in the gaps between points, as the run's view.html does."""
     words = ("view", shown, "-o", "page.html", "-w")
     succeeds(command_line, folder, *words)
     assert '"background": [' in (folder / "page.html").read_text()
