@@ -26,7 +26,7 @@ from g2ard.cli.fields import FIELDS
 from g2ard.cli.panels import Command, in_panel, ordered
 from g2ard.cli.run import Run
 from g2ard.cli.usage import flags_of, in_flags, typed
-from g2ard.config.choices import RenderModel
+from g2ard.config.choices import PointColor, RenderModel
 from g2ard.errors import G2ardError
 from g2ard.progress import plural
 from g2ard.system import devices, interrupt
@@ -88,6 +88,28 @@ _SCENE_OPTIONS: dict[str, tuple[Any, ...]] = {
 }
 
 
+_POINT_OPTIONS: dict[str, tuple[Any, ...]] = {
+    "box": (
+        str | None,
+        typer.Option(
+            metavar="X,Y,Z,X,Y,Z", help="Of a point cloud, keep points between two corners, in its units."
+        ),
+    ),
+    "where": (
+        str | None,
+        typer.Option(
+            metavar="CONDITION",
+            help="Of a point cloud, keep points for which this holds, such as 'classification == 2'. Names "
+            "are x, y, z, red, green, blue (0 to 1), and the columns of the file.",
+        ),
+    ),
+    "color": (
+        PointColor | None,
+        typer.Option(help="Colour points by their intensity, or by their class."),
+    ),
+}
+
+
 def command(
     name: str,
     *,
@@ -99,6 +121,7 @@ def command(
     budgets: bool = False,
     several: bool = False,
     tiles: bool = False,
+    points: bool = False,
     outputs: Collection[str] = ("output",),
     without: Collection[str] = (),
 ) -> Callable[[Any], Any]:
@@ -113,6 +136,7 @@ def command(
         budgets: whether it takes a budget, see `g2ard.cli.outputs.budget_of`.
         several: whether it takes several, see `g2ard.cli.outputs.budgets_of`.
         tiles: whether it works on scenes in tiles, see `g2ard.cli.work_folder.tiling_of`.
+        points: whether it takes point clouds, of which `g2ard.cli.options.choose_points` chooses points.
         outputs: parameters that are paths to write, all of which it passes to `Run.claim`.
         without: common options that have no effect on it.
     """
@@ -133,6 +157,7 @@ def command(
         shared_options |= {key: value for key, value in _COMMON_OPTIONS.items() if key not in without}
         shared_options |= {} if settings is None else _SETTINGS
         shared_options |= _SCENE_OPTIONS if scenes else {}
+        shared_options |= _POINT_OPTIONS if points else {}
         all_parameters = [*own, *(_parameter(key, *options) for key, options in shared_options.items())]
         if parent is app:
             all_parameters = [in_panel(name, p) for p in ordered(name, all_parameters)]

@@ -24,6 +24,7 @@ from g2ard.errors import require_torch
 
 if TYPE_CHECKING:
     from g2ard.cli.run import Run
+    from g2ard.io import Source
 
 SceneArgument = Annotated[
     Path,
@@ -139,6 +140,16 @@ def _direction(text: str) -> Triple:
     if len(found) != 3 or not any(found) or max(map(abs, found)) > 1e30:
         raise typer.BadParameter(f"expected a direction such as 0,0,1 or 0,-1,0, got {text!r}")
     return Triple(found)
+
+
+def choose_points(run: Run, source: Source | None) -> None:
+    """Make a source read only the points of --box and --where, in the colours of --color."""
+    from g2ard.jobs.chosen_points import PointChoice
+
+    box, where, color = (run.shared[name] for name in ("box", "where", "color"))
+    with run.usage():
+        choice = PointChoice(None if box is None else numbers("--box", box, 6), where, color)
+        choice.narrow(source, run.progress)
 
 
 UpOption = Annotated[

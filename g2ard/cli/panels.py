@@ -18,10 +18,10 @@ USED: dict[str, tuple[str, ...]] = {
     ),
     "adapt": ("output", "views", "teacher", "images", "size", "steps", "background", "resume"),
     "register": ("output", "photos", "poses", "pool", "focal", "intrinsics", "size", "matcher", "report"),
-    "lift": ("output", "overwrite"),
+    "lift": ("output", "box", "where", "color", "overwrite"),
     "ingest": ("output", "tile_rows", "overwrite"),
     "convert": (
-        *("overwrite", "sh_degree", "box", "sphere", "where"),
+        *("overwrite", "sh_degree", "box", "sphere", "where", "color"),
         *("scale", "rotate", "translate", "from_axes", "to_axes"),
     ),
     "clean": ("output", "only", "strength", "split_sky", "preview", "dry_run", "overwrite"),
@@ -63,8 +63,8 @@ _PANELS = {
         *("depth", "around", "fps"),
     ),
     "Geometry": (
-        *("box", "sphere", "invert", "where", "transform", "scale", "rotate", "translate", "recentre"),
-        *("from_axes", "to_axes"),
+        *("box", "sphere", "invert", "where", "color", "transform"),
+        *("scale", "rotate", "translate", "recentre", "from_axes", "to_axes"),
     ),
     "Large scenes": ("memory", "workers", "tile_rows", "scheduler", "work"),
     "Common": (

@@ -26,7 +26,6 @@ from g2ard.errors import InputError, OutputError
 from g2ard.io import Source, write_views
 from g2ard.io.atomic import atomic_output, check_output, drop_empty, drop_temporaries
 from g2ard.io.jsonfile import read_json
-from g2ard.io.labels import DENSE, RESULT, labels_of, names_of
 from g2ard.io.lock import check_unlocked, locked
 from g2ard.io.reports import Report, plain
 from g2ard.io.scene_formats import FORMATS
@@ -36,6 +35,7 @@ from g2ard.jobs.cost import LARGEST_DENSE
 from g2ard.jobs.viewer_frame import backdrop, frame_with
 from g2ard.pipeline.distill import RunViews
 from g2ard.rendering.targets import fill
+from g2ard.report.labels import DENSE, RESULT, labels_of, names_of
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats
 from g2ard.viewer.page import write_page

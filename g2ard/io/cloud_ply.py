@@ -39,6 +39,7 @@ class Stream(PointStream):
         header, self.path = read_header(path), path
         self._named = scene_names(header.properties("vertex"))
         require(list(self._named), _POSITION, "a point cloud")
+        self.fields = tuple(self._named)
         (self._vertices,) = read_element(path, header, "vertex")
         rows = spread_rows(self._vertices)
         choices = [names for names in COLOR_NAMES if set(names) <= set(self._named)]
@@ -73,6 +74,7 @@ class Stream(PointStream):
             columns = [_color(self.path, c, name) for c, name in zip(columns, self._names, strict=True)]
         elif columns and self._names[0] in _PACKED:
             columns = judge.unpacked(columns[0])
+        columns += [rows[self._named[name]] for name in self.also]
         noise = np.zeros(len(rows), bool)
         with np.errstate(invalid="ignore", over="ignore"):  # a signalling NaN
             positions = np.stack([rows[self._named[axis]].astype(float) for axis in _POSITION], axis=1)

@@ -22,6 +22,7 @@ _COLUMNS = {
     "blue": r"(scalar_|colou?r_|diffuse_)?b(lue|f)?",
     "rgb": r"rgba?",
     "intensity": r"(scalar_)?(i|intensit\w*)|reflect\w*",
+    "classification": r"(scalar_)?class\w*",
 }
 """Columns and their names in headings, in small letters and without units."""
 
@@ -53,7 +54,8 @@ class Stream(HeldPoints):
             raise InputError(f"has no column {missing[0]!r} (found {' '.join(names)})")
         shades: tuple[str, ...] = next((names for names in _SHADES if set(names) <= set(column)), ())
         positions, values = (table[:, [column[name] for name in names]] for names in ("xyz", shades))
-        super().__init__(path, positions, values, judge.full_scales(np.dtype(float)))
+        columns = dict(zip(names, table.T, strict=False))
+        super().__init__(path, positions, values, judge.full_scales(np.dtype(float)), columns)
         if not shades:
             self.lack = f"has no colours (found columns {' '.join(names)}); name them red, green and blue"
 

@@ -82,7 +82,8 @@ class _Scan(PointStream):
 
     def __init__(self, path: Path, header: Any, number: int) -> None:
         self.path, self.count, self._number = path, header.point_count, number
-        self._names = names = set(header.point_fields)
+        self.fields = tuple(header.point_fields)
+        self._names = names = set(self.fields)
         place = next((fields for fields in (_CARTESIAN, _SPHERICAL) if names.issuperset(fields)), None)
         if place is None:
             what = "has no positions (cartesianX, cartesianY, cartesianZ)"
@@ -123,7 +124,7 @@ class _Scan(PointStream):
         from pye57 import libe57
 
         with _opened(self.path) as file:
-            names = (*self._place, *self._color, *self._marks())
+            names = dict.fromkeys((*self._place, *self._color, *self._marks(), *self.also))
             fields = {name: np.empty(rows) for name in names}
             buffers = libe57.VectorSourceDestBuffer()
             for name, values in fields.items():
@@ -145,13 +146,14 @@ class _Scan(PointStream):
         if self._place == _SPHERICAL:  # range, azimuth, elevation
             a, b, c = a * np.cos(c) * np.cos(b), a * np.cos(c) * np.sin(b), a * np.sin(c)
         positions = np.stack([a, b, c], axis=1) @ self._rotation.T + self._translation
-        colors = np.zeros((len(positions), len(self._color)), np.float32)
-        for channel, name in enumerate(self._color):
+        names = self._color + self.also
+        colors = np.zeros((len(positions), len(names)), np.float32)
+        for channel, name in enumerate(names):
             colors[:, channel] = fields[name]
         noise = (a == 0) & (b == 0) & (c == 0)  # relative to the scanner: no return
         for name in self._marks():
             if name in _UNSEEN.get(self._color, ()):
-                colors[fields[name] != 0] = 0
+                colors[fields[name] != 0, : len(self._color)] = 0
             else:
                 noise |= fields[name] != 0
         return positions, colors, noise

@@ -38,8 +38,8 @@ class Stream(PointStream):
     def __init__(self, path: Path) -> None:
         with _opened(path) as reader:
             count, header = reader.header.point_count, reader.header
-            names = set(header.point_format.dimension_names)
-            choices = [fields for fields in (_RGB, ("intensity",)) if names.issuperset(fields)]
+            self.fields = tuple(header.point_format.dimension_names)
+            choices = [names for names in (_RGB, ("intensity",)) if {*self.fields}.issuperset(names)]
             runs = []
             for first in sorted({count * part // _SAMPLES for part in range(_SAMPLES)}) if count else []:
                 reader.seek(first)
@@ -69,7 +69,7 @@ class Stream(PointStream):
                 las = reader.read_points(wanted)
                 if len(las) < wanted:
                     _check_count(first + len(las), self.count)
-                yield _points(las, self._color)
+                yield _points(las, self._color + self.also)
 
 
 def _points(las: Any, color: Names) -> MarkedPoints:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -32,6 +32,7 @@ class Source:
 
     Attributes:
         file: the file or folder itself, which in the folder of a run is its scene.
+        through: changes the point cloud when it is opened, as to fewer points; None leaves it.
     """
 
     def __init__(
@@ -42,6 +43,7 @@ class Source:
     ) -> None:
         self.path, self.file, self.render_model = Path(path), run_scene(path), render_model
         self.others = tuple(Source(other, render_model) for other in others)
+        self.through: Callable[[PointStream], PointStream] | None = None
 
     def __str__(self) -> str:
         return str(self.path)
@@ -76,7 +78,7 @@ class Source:
     @cached_property
     def _points(self) -> PointStream:
         stream: PointStream = self._opened("points")
-        return stream
+        return self.through(stream) if self.through else stream
 
     def cloud(self, *, bare: bool = False) -> PointStream:
         """Return the point cloud in blocks.

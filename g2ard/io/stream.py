@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Generic, TypeVar
 
 import numpy as np
@@ -216,7 +217,12 @@ class PointStream(Stream[RawPoints]):
         system: the map system that the file states.
         metres_per_unit: of its positions, if the file states it.
         axes: axes of the coordinates: z is up in maps; None if neither the format nor a map tells.
+        fields: names of the file's columns.
+        also: those that `raw` yields behind the colours.
     """
+
+    fields: Names = ()
+    also: Names = ()
 
     def __init__(
         self,
@@ -333,12 +339,21 @@ class PointStream(Stream[RawPoints]):
 class HeldPoints(PointStream):
     """Point cloud in memory, of which nothing is marked as noise."""
 
-    def __init__(self, path: Path, positions: Float, values: Values, scales: Sequence[float]) -> None:
+    def __init__(
+        self,
+        path: Path,
+        positions: Float,
+        values: Values,
+        scales: Sequence[float],
+        columns: Mapping[str, Values] = MappingProxyType({}),
+    ) -> None:
         self._held = positions, values.astype(np.float32), np.zeros(len(positions), bool)
+        self.fields, self._columns = tuple(columns), columns
         super().__init__(path, len(positions), self._held, scales)
 
     def raw(self, rows: int, start: int) -> Iterator[MarkedPoints]:
         positions, values, noise = self._held
+        values = np.column_stack([values, *map(self._columns.__getitem__, self.also)]).astype(np.float32)
         for first in range(start, self.count, rows):
             part = slice(first, first + rows)
             yield positions[part], values[part], noise[part]

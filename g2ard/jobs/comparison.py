@@ -12,11 +12,11 @@ import numpy as np
 from g2ard.errors import InputError
 from g2ard.io.detect import run_background, run_scene, run_views
 from g2ard.io.jsonfile import read_json
-from g2ard.io.labels import DENSE, RESULT
 from g2ard.io.paths import real_path
 from g2ard.io.types import ViewSet
 from g2ard.jobs.inputs import Views, load_split_views
 from g2ard.rendering.targets import RENDERS, Targets, scored_in
+from g2ard.report.labels import DENSE, RESULT
 from g2ard.scene.cameras import Camera, Cameras
 from g2ard.stages.evaluate import Evaluation
 

@@ -11,13 +11,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from g2ard.config.checks import Degree, Positive, checks_arguments
-from g2ard.config.choices import AxesName, RenderModel
+from g2ard.config.choices import AxesName, PointColor, RenderModel
 from g2ard.config.schema import Settings
 from g2ard.errors import InputError, require
 from g2ard.io import Source, spz
 from g2ard.io.scene_formats import FORMATS
-from g2ard.jobs.inputs import load_scene
-from g2ard.progress import Say, unsaid
+from g2ard.jobs.chosen_points import PointChoice
+from g2ard.jobs.inputs import lifted_cloud, load_scene
+from g2ard.progress import Progress, Say, silent, unsaid
 from g2ard.scene.attributes import check_condition, fulfilling
 from g2ard.scene.splats import Splats
 from g2ard.scene.transform import (
@@ -120,12 +121,14 @@ def convert(
     to_axes: AxesName | None = None,
     sh_degree: int | None = None,
     render_model: RenderModel | None = None,
+    color: PointColor | None = None,
     say: Say = unsaid,
 ) -> Splats:
     """Merge, crop and move scenes, exactly like the command `g2ard convert`; `g2ard.save` writes the result.
 
-    Options apply in their order here. `to_axes` suits formats without axes of their own, such as .ply; for
-    .spz, pass `axes` and `spz_version` to `save` instead. `layout` and `compress` are options of `save` too.
+    Point clouds alone are cropped first, by `box` and `where`, and then lifted. Options apply in their order
+    here. `to_axes` suits formats without axes of their own, such as .ply; for .spz, pass `axes` and
+    `spz_version` to `save` instead. `layout` and `compress` are options of `save` too.
 
     Args:
         scenes: a scene or several, or their paths.
@@ -133,7 +136,7 @@ def convert(
         sphere: centre and radius (x, y, z, r) of what to keep.
         invert: keep what `box` and `sphere` would drop.
         where: condition on the Gaussians to keep, such as "opacity > 0.05 and elongation < 9"; see
-            `g2ard.scene.attributes`.
+            `g2ard.scene.attributes`. On points it may use the columns of their files: "classification == 2".
         transform: (4, 4) matrix of uniform scale, rotation and translation, row-major.
         scale: factor about the origin.
         rotate: angles about the x, y and z axes in turn, degrees.
@@ -143,6 +146,7 @@ def convert(
         to_axes: axes of the result; a scene in memory is "RDF" (right, down, forward).
         sh_degree: SH degree of the result, 0 to 3.
         render_model: overrides what the scenes' files say.
+        color: "intensity" or "class" to colour points by; None takes their colours.
         say: called with log messages.
 
     Returns:
@@ -155,22 +159,50 @@ def convert(
     >>> convert([pair, pair], where="x > 1", scale=2).means.tolist()
     [[10.0, 0.0, 0.0], [10.0, 0.0, 0.0]]
     """
+    opened = opened_scenes(scenes, render_model)
+    points = None if color is None else PointChoice(color=color)
+    if isinstance(opened, Source):
+        points, where = PointChoice(None if invert else box, where, color), None
     changes = Changes(
         box, sphere, invert, where, transform, scale, rotate, translate, recentre, to_axes, sh_degree
     )
-    return changes.apply(read_merged(scenes, from_axes, render_model, say))
+    return changes.apply(read_merged(opened, points, from_axes, say))
+
+
+def opened_scenes(
+    scenes: Scene | Sequence[Scene], render_model: RenderModel | None = None
+) -> Source | list[Splats | Source]:
+    """Return scenes that are not read yet; point clouds alone become one."""
+    several = [scenes] if isinstance(scenes, Splats | str | Path) else list(scenes)
+    sources = [scene if isinstance(scene, Splats) else Source(scene, render_model) for scene in several]
+    if sources and all(isinstance(one, Source) and one.kind == "points" for one in sources):
+        first, *others = (Path(one) for one in several if not isinstance(one, Splats))
+        return Source(first, render_model, others)
+    return sources
 
 
 def read_merged(
-    scenes: Scene | Sequence[Scene],
+    opened: Source | list[Splats | Source],
+    points: PointChoice | None = None,
     from_axes: AxesName | None = None,
-    render_model: RenderModel | None = None,
     say: Say = unsaid,
+    progress: Progress = silent,
 ) -> Splats:
-    """Read scenes and join them; the arguments are those of `convert`."""
-    several = [scenes] if isinstance(scenes, Splats | str | Path) else scenes
-    sources = [scene if isinstance(scene, Splats) else Source(scene, render_model) for scene in several]
-    return join([_loaded(source, from_axes, say) for source in sources])
+    """Read the result of `opened_scenes` and join it; point clouds are lifted.
+
+    Args:
+        points: of point clouds to read.
+        from_axes: see `convert`.
+    """
+    if not isinstance(opened, Source):
+        if points is not None:
+            raise InputError("is for point clouds alone", parameter=points.given[0])
+        return join([_loaded(source, from_axes, say) for source in opened])
+    if from_axes is not None:
+        raise InputError("has no effect on point clouds", parameter="from_axes")
+    if points is not None:
+        points.narrow(opened, progress)
+    return lifted_cloud(opened, progress, say)
 
 
 def _loaded(scene: Splats | Source, axes: AxesName | None, say: Say) -> Splats:

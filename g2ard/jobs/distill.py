@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g2ard.config.checks import AtLeastOne, Positive, checks_arguments
-from g2ard.config.choices import Colour, FormatName, RenderModel, is_made
+from g2ard.config.choices import Colour, FormatName, PointColor, RenderModel, is_made
 from g2ard.config.schema import keywords, listed
 from g2ard.errors import InputError
 from g2ard.io import Source, read_splats
@@ -22,6 +22,7 @@ from g2ard.io.paths import real_path
 from g2ard.io.types import Cloud, Points, ViewSet
 from g2ard.jobs.budget import Budget, count_of
 from g2ard.jobs.budget_search import ResolvedBudget
+from g2ard.jobs.chosen_points import PointChoice
 from g2ard.jobs.clean import clean as remove_clutter
 from g2ard.jobs.distill_options import LEAST_RECOVERY_SHARE, DistillOptions
 from g2ard.jobs.doubts import doubts_of_regions, doubts_of_views
@@ -415,6 +416,9 @@ def distill(
     size: AtLeastOne | None = None,
     clean: bool = False,
     render_model: RenderModel | None = None,
+    box: Sequence[float] | None = None,
+    where: str | None = None,
+    color: PointColor | None = None,
     format: FormatName = "ply",
     preset: str = "auto",
     time: Positive | None = None,
@@ -459,6 +463,9 @@ def distill(
         up: (3,) direction away from the ground for generated views; None estimates it.
         clean: remove invisible and stray Gaussians first, like `g2ard clean`.
         render_model: "classic" or "antialiased": overrides what the scene's file says.
+        box: of a point cloud's file, keep points between two corners (x, y, z, x, y, z).
+        where: keep points for which this holds, such as "classification == 2".
+        color: "intensity" or "class" to colour points by.
         beside: a path to look for cameras beside, if `scene` is not a path.
         time: seconds that the whole call may take, roughly: recovery gets what the rest leaves.
         steps: steps of the final recovery; None takes the schedule's, and more where views or points need
@@ -526,6 +533,7 @@ def distill(
         settings=changed | dict(settings or {}),
     )
     source = Source(scene, render_model) if isinstance(scene, str | Path) else scene
+    PointChoice(box, where, color).narrow(source, progress)
     job = prepare(source, budget, options, progress=progress, say=say)
     done = job.run(work)
     if judgement := job.budget.judge(done.splats):

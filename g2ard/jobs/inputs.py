@@ -32,7 +32,7 @@ from g2ard.scene.cameras import Cameras
 from g2ard.scene.regions import in_any
 from g2ard.scene.splats import Splats
 from g2ard.scene.transform import up_in
-from g2ard.stages.lift import guessed_axes
+from g2ard.stages.lift import guessed_axes, lift
 from g2ard.stages.simplify import Pairs, SimplifyConfig
 
 Views = Cameras | ViewSet | ViewFiles | str | Path  # cameras, or the path of views
@@ -86,6 +86,18 @@ def axes_of(cloud: Cloud, name: str, say: Say = unsaid, progress: Progress = sil
     sign = "−" if min(up_in(axes)) < 0 else ""
     say(f"note: {name}: {sign}{up} is taken for up, a guess from its surfaces; results stand upright by it")
     return axes
+
+
+def lifted_cloud(source: Source, progress: Progress = silent, say: Say = unsaid) -> Splats:
+    """Read a point cloud, report its notes, and lift it."""
+    cloud = source.cloud().whole()
+    for note in cloud.notes:
+        say(f"{source}: {note}")
+    axes = axes_of(cloud, str(source), say, progress)
+    splats = lift(cloud.points.positions, cloud.points.colors, axes=axes, progress=progress)
+    discs = plural(len(splats), "disc")
+    say(f"{source}: {plural(len(cloud.points), 'point')} lifted to {discs}, as `g2ard lift` does")
+    return splats
 
 
 def say_regions(splats: Splats, config: SimplifyConfig, name: str, say: Say) -> None:

@@ -18,7 +18,6 @@ from g2ard.config.checks import AtLeastOne, checks_arguments
 from g2ard.config.choices import BLACK, UNITS, Colour, LengthUnit, RenderModel
 from g2ard.errors import InputError
 from g2ard.io import Source
-from g2ard.io.labels import names_of
 from g2ard.io.reports import Report
 from g2ard.io.scenes import tell
 from g2ard.io.tile_store import TileStore
@@ -33,6 +32,7 @@ from g2ard.levels.tileset import save_tileset as write_tileset
 from g2ard.levels.tree import Cut, Level, aligned
 from g2ard.pipeline.dense import Dense
 from g2ard.progress import Progress, Say, direction, plural, silent, unsaid
+from g2ard.report.labels import names_of
 from g2ard.scene.regions import sky_mask
 from g2ard.scene.samples import evenly_spaced
 from g2ard.scene.splats import Splats

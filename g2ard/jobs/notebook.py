@@ -17,13 +17,13 @@ from g2ard.config.choices import Colour
 from g2ard.errors import InputError
 from g2ard.io import Source
 from g2ard.io.images import load_photo, png_bytes, resized
-from g2ard.io.labels import RESULT, labels_of
 from g2ard.jobs.inputs import GivenViews, Views, load_scene
 from g2ard.jobs.viewer_frame import backdrop, frame_of
 from g2ard.poses import best_views
 from g2ard.progress import Progress, Say, kernel, silent, unsaid
 from g2ard.rendering.renderer import Renderer
 from g2ard.rendering.targets import Targets
+from g2ard.report.labels import RESULT, labels_of
 from g2ard.report.sheet import contact_sheet
 from g2ard.scene.cameras import Camera, Cameras
 from g2ard.scene.samples import evenly_spaced

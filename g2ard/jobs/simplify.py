@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from g2ard.config.checks import check_seed, checks_arguments
-from g2ard.config.choices import FormatName, RenderModel
+from g2ard.config.choices import FormatName, PointColor, RenderModel
 from g2ard.errors import InputError
 from g2ard.io import Source
 from g2ard.io.scene_formats import check_positions, scene_format
@@ -24,13 +24,13 @@ from g2ard.jobs.budget_search import (
     count_for_layers,
     count_for_quality,
 )
-from g2ard.jobs.inputs import GivenViews, Views, axes_of, load_scene, say_regions
+from g2ard.jobs.chosen_points import PointChoice
+from g2ard.jobs.inputs import GivenViews, Views, lifted_cloud, load_scene, say_regions
 from g2ard.pipeline.dense import Dense, InMemory, whole
 from g2ard.pipeline.presets import configured
 from g2ard.progress import Progress, Say, plural, silent, unsaid
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats
-from g2ard.stages.lift import lift
 from g2ard.stages.simplify import Pairs, Simplified, SimplifyConfig
 from g2ard.stages.simplify import simplify as merge
 from g2ard.stages.simplify.gaps import say_gaps
@@ -268,14 +268,8 @@ def reducing(
         return
     progress("read", 0, 0)
     if scene.kind == "points":
-        cloud = scene.cloud().whole()
-        for note in cloud.notes:
-            say(f"{scene}: {note}")
-        points, notes = cloud.points, cloud.notes
-        axes = axes_of(cloud, str(scene), say, progress)
-        splats = lift(points.positions, points.colors, axes=axes, progress=progress)
-        discs = plural(len(splats), "disc")
-        say(f"{scene}: {plural(len(points), 'point')} lifted to {discs}, as `g2ard lift` does")
+        splats = lifted_cloud(scene, progress, say)
+        notes = scene.cloud().all_notes()
     else:
         splats, notes = load_scene(scene, say), scene.notes
     counted(len(splats))
@@ -301,6 +295,9 @@ def simplify(
     beside: str | Path | None = None,
     up: Sequence[float] | None = None,
     render_model: RenderModel | None = None,
+    box: Sequence[float] | None = None,
+    where: str | None = None,
+    color: PointColor | None = None,
     seed: int = 0,
     progress: Progress = silent,
     say: Say = unsaid,
@@ -330,6 +327,9 @@ def simplify(
         beside: where to look for cameras, if `scene` is not a path: in its folder and its trainer's.
         up: (3,) direction away from the ground for generated views; None estimates it.
         render_model: overrides what the scene's file says.
+        box: of a point cloud's file, keep points between two corners (x, y, z, x, y, z).
+        where: keep points for which this holds, such as "classification == 2".
+        color: "intensity" or "class" to colour points by.
         seed: seed of generated views.
         progress: called during planning, visibility and merging.
         say: called with log messages.
@@ -356,6 +356,7 @@ def simplify(
     given_views = GivenViews(views, beside, up, seed)
     inputs: dict[str, Any] = {"given": given_views, "blind": blind, "progress": progress, "say": say}
     source = scene if isinstance(scene, Splats) else Source(scene, render_model)
+    PointChoice(box, where, color).narrow(source, progress)
     with reducing(source, config=config, **inputs) as reduce:
         budget = reduce.resolved(wanted, name, f"scene.{format}")
         small: Simplified = reduce(budget.count)

@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 
 from g2ard.config.choices import BLACK, Colour
 from g2ard.io.images import to_bytes, write_png
-from g2ard.io.labels import DENSE, RESULT, TARGET, labels_of
 from g2ard.progress import plural
 from g2ard.rendering.exposure import rendered
 from g2ard.rendering.metrics import psnr
 from g2ard.rendering.renderer import Renderer
 from g2ard.rendering.targets import Targets, mask_of
+from g2ard.report.labels import DENSE, RESULT, TARGET, labels_of
 from g2ard.report.page import Page, Shown
 from g2ard.report.run import COLUMNS, LOST, KindScore, RunReport, cells
 from g2ard.report.sheet import contact_sheet

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from g2ard.io.atomic import atomic_output
 from g2ard.io.images import to_bytes
-from g2ard.io.labels import TARGET
+from g2ard.report.labels import TARGET
 
 _WINDOW, _CROPS = 0.28, 2  # side of an automatic crop as a share of the image's, and number of crops
 _LONGEST = 1280

@@ -8,9 +8,9 @@ from dataclasses import dataclass, field
 from statistics import fmean
 from typing import Any
 
-from g2ard.io.labels import RESULT
 from g2ard.io.reports import LEFT_OUT, Report
 from g2ard.progress import plural
+from g2ard.report.labels import RESULT
 from g2ard.scene.cameras import USUAL, rows_by_kind
 from g2ard.stages.evaluate import Evaluation, Means, ViewScore
 from g2ard.stages.recover.anchors import PriorMeasures

@@ -388,13 +388,17 @@ def one_model(models: Sequence[RenderModel]) -> RenderModel:
 
 def in_box(splats: Splats, low: ArrayLike, high: ArrayLike) -> NDArray[np.bool_]:
     """Return the (N,) mask of means in an axis-aligned box (inclusive), world coordinates."""
+    return within_box(splats.means.astype(np.float64) + splats.offset, low, high)
+
+
+def within_box(world: NDArray[np.float64], low: ArrayLike, high: ArrayLike) -> NDArray[np.bool_]:
+    """Return the (N,) mask of (N, 3) positions in an axis-aligned box (inclusive)."""
     low, high = (np.asarray(v, np.float64) for v in (low, high))
     if not (low <= high).all():
         raise InputError(
             f"from {low.tolist()} to {high.tolist()} holds nothing; the lower corner comes first",
             parameter="box",
         )
-    world = splats.means.astype(np.float64) + splats.offset
     inside: NDArray[np.bool_] = np.all((world >= low) & (world <= high), axis=1)
     return inside
 

@@ -172,7 +172,7 @@ def _opened(
         return source, [str(source.path)]
     several = [source] if isinstance(source, str | Path | Source) else source
     sources = [one if isinstance(one, Source) else Source(one, render_model) for one in several]
-    return joined(sources), [str(one) for one in sources]
+    return joined(sources), [str(one) for each in sources for one in (each, *each.others)]
 
 
 def _done(folder: Path, key: str, overwrite: bool) -> TileStore | None:

@@ -15,6 +15,7 @@ import numpy as np
 from PIL import Image
 
 import g2ard
+from helpers.cloud_files import las
 from helpers.photos import cloud_of, photographed
 from helpers.scenes import around, checkered_ball, under_a_sky
 
@@ -135,6 +136,9 @@ COMMON = {
     "alpha": "mask",
     "photos": "",
     "convention": "inria",
+    "box": "-1,-1,0,1,1,1",
+    "where": "classification==2",
+    "color": "class",
 }
 """Values of options that several commands have."""
 
@@ -146,7 +150,7 @@ def _common(names: str) -> dict[str, str]:
 VALUES: dict[str, dict[str, str]] = {
     "distill": {
         **_common("count ratio fit min_psnr min_ssim views alpha photos method keep_region schedule"),
-        **_common("steps sh_degree size background up tile_rows render_model"),
+        **_common("steps sh_degree size background up tile_rows render_model box where color"),
         "images": "other --photos",
         "held_out": "few.json",
         "preset": "lift",
@@ -160,7 +164,7 @@ VALUES: dict[str, dict[str, str]] = {
     },
     "simplify": {
         **_common("count ratio fit min_psnr min_ssim views images preset method keep_region up"),
-        **_common("tile_rows render_model"),
+        **_common("tile_rows render_model box where color"),
         "no_views": "",
         "parents": "rows.npy",
     },
@@ -180,6 +184,7 @@ VALUES: dict[str, dict[str, str]] = {
         "prior_views": "9",
     },
     "lift": {
+        **_common("box where color"),
         "neighbors": "5",
         "spread": "2",
         "normal_ratio": "0.3",
@@ -187,8 +192,7 @@ VALUES: dict[str, dict[str, str]] = {
         "opacity": "0.9",
     },
     "convert": {
-        **_common("sh_degree render_model"),
-        "box": "-1,-1,0,1,1,1",
+        **_common("sh_degree render_model box color"),
         "sphere": "0,0,0.5,0.9",
         "where": "x<0.5",
         "invert": "",
@@ -235,7 +239,7 @@ VALUES: dict[str, dict[str, str]] = {
         "start": "view_009",
     },
     "lod": {
-        **_common("views images steps size background up tile_rows render_model"),
+        **_common("views images steps size background up tile_rows render_model box where color"),
         "ratios": "2,5",
         "recover": "--steps 30",
         "environment": "--ratios 2,4",
@@ -260,7 +264,7 @@ VALUES: dict[str, dict[str, str]] = {
         "output": "page.html",
         "looks": "5",
     },
-    "ingest": _common("tile_rows render_model"),
+    "ingest": _common("tile_rows render_model box where color"),
     "register": {
         **_common("format split alpha background render_model"),
         "photos": "photos.json",
@@ -286,23 +290,30 @@ VALUES: dict[str, dict[str, str]] = {
 
 _REGISTER = "register ball.ply --keep all --poses moved.json -o out.json"
 _MATCHED = f"{_REGISTER} --images two.json --matcher matches:grid"
+_CHOICES = ("box", "where", "color")
 ON: dict[str, dict[str, str]] = {
+    "lift": dict.fromkeys(_CHOICES, "lift scan.las -o out.ply"),
+    "ingest": dict.fromkeys(_CHOICES, "ingest scan.las --tile-rows 150 -o out"),
     "simplify": {
+        **dict.fromkeys(_CHOICES, "simplify scan.las -r 8 --no-views -o out.ply"),
         **dict.fromkeys(("no_views", "preset", "up"), "simplify ball.ply -r 8 -o out.ply"),
         "images": "simplify ball.ply -r 8 --views sizeless.json -o out.ply",
     },
     "select": {"images": "select ball.ply --views sizeless.json -k 4 -o out.json"},
     "distill": {
+        **dict.fromkeys(_CHOICES, "distill scan.las -r 8 --steps 3 --size 24 --no-page -o out"),
         "views_format": "distill ball.ply -r 8 --steps 3 --size 24 --views made --no-page -o out",
         "compare": "distill ball.ply -r 8 --steps 3 --size 24 --views photos.json --renders -o out",
     },
     "adapt": dict.fromkeys(("alpha", "images"), "adapt small.ply --views photos.json --steps 3 -o out.ply"),
     "convert": {
+        "color": "convert scan.las -o out.ply",
         "compress": "convert ball.ply -o out.glb",
         "spz_version": "convert ball.ply -o out.spz",
         "invert": "convert ball.ply --sphere 0,0,0.5,0.9 -o out.ply",
     },
     "lod": {
+        **dict.fromkeys(_CHOICES, "lod scan.las -r 1,4 --size 24 --merge-only -o out"),
         "images": "lod ball.ply -r 1,4 --views sizeless.json --steps 3 -o out",
         "steps": "lod ball.ply -r 1,4 --views photos.json --size 24 -o out",
         "place": "lod ball.ply -r 4,8 --views photos.json --size 24 --merge-only --format 3dtiles -o out",
@@ -376,6 +387,8 @@ def write_inputs(folder: Path) -> None:
     faint = np.where(np.arange(400) < 20, -9, 3).astype(np.float32)
     g2ard.save(folder / "stray.ply", under_a_sky(replace(ball, logit_opacities=faint)))
     cloud_of(folder / "cloud.ply", ball)
+    classes, rgb = np.arange(400, dtype=np.uint8) % 2 + 2, np.arange(1200).reshape(400, 3) * 50
+    las(folder / "scan.las", ball.means.astype(float), rgb.astype(np.uint16), classification=classes)
     g2ard.save_views(folder / "views.json", views)
     g2ard.save_views(folder / "few.json", around(10, (48, 36), 2.5))
     for name, scene in (("photos", ball), ("other", checkered_ball(300, seed=1))):

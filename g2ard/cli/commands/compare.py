@@ -12,9 +12,9 @@ from g2ard.cli.command import command
 from g2ard.cli.run import Run
 from g2ard.config.choices import BLACK, Colour, is_made
 from g2ard.io import Source
-from g2ard.io.labels import labels_of, names_of
 from g2ard.io.paths import real_path
 from g2ard.progress import plural
+from g2ard.report.labels import labels_of, names_of
 
 if TYPE_CHECKING:
     from g2ard.scene.splats import Splats

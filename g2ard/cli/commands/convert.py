@@ -12,8 +12,9 @@ from g2ard.cli.command import command
 from g2ard.cli.fields import ShDegreeOption
 from g2ard.cli.options import numbers
 from g2ard.cli.run import Run
-from g2ard.config.choices import NAMED_AXES, Axes, AxesName, PlyLayout
+from g2ard.config.choices import NAMED_AXES, Axes, AxesName, PlyLayout, PointColor
 from g2ard.errors import InputError, OutputError
+from g2ard.io import Source
 from g2ard.io.scene_formats import SceneFormat, check_options, scene_format, written_bytes
 
 
@@ -58,8 +59,13 @@ def convert(
             metavar="CONDITION",
             help="Keep Gaussians for which this holds, such as 'opacity > 0.05 and largest_scale < 2'. "
             "Opacity, red, green and blue are 0 to 1; x, y, z, smallest_scale and largest_scale (standard "
-            "deviations) are in scene units; elongation is the largest over the middle scale.",
+            "deviations) are in scene units; elongation is the largest over the middle scale. Of "
+            "point clouds, names are x, y, z, red, green, blue and the columns: 'classification == 2'.",
         ),
+    ] = None,
+    color: Annotated[
+        PointColor | None,
+        typer.Option(help="Colour points of clouds by their intensity, or by their class."),
     ] = None,
     transform: Annotated[
         str | None,
@@ -110,9 +116,13 @@ def convert(
         Literal["spz"] | None, typer.Option(help="Write an SPZ inside of a .glb, for CesiumJS.")
     ] = None,
 ) -> None:
-    """Convert scenes to another format or other axes, and merge, crop or move them."""
+    """Convert scenes to another format or other axes, and merge, crop or move them.
+
+    Point clouds are cropped and then lifted, as by `g2ard lift`.
+    """
     from g2ard.io.scenes import write_table
-    from g2ard.jobs.convert import Changes, read_merged
+    from g2ard.jobs.chosen_points import PointChoice
+    from g2ard.jobs.convert import Changes, opened_scenes, read_merged
 
     scenes, output = _parted(run, scenes, output)
     given = {"spz_version": spz_version, "compress": compress, "layout": layout}
@@ -120,9 +130,15 @@ def convert(
     if layout is not None and sh_degree not in (None, 3):
         raise typer.BadParameter("--layout inria has SH degree 3; leave --sh-degree out")
     matrix = None if transform is None else _matrix(transform)
+    opened, points = opened_scenes(scenes, run.render_model), None
+    corners = None if box is None else numbers("--box", box, 6)
     with run.usage():
+        if isinstance(opened, Source):
+            points, where = PointChoice(None if invert else corners, where, color), None
+        elif color is not None:
+            points = PointChoice(color=color)
         changes = Changes(
-            box=None if box is None else numbers("--box", box, 6),
+            box=corners,
             sphere=None if sphere is None else numbers("--sphere", sphere, 4),
             invert=invert,
             where=where,
@@ -140,7 +156,7 @@ def convert(
         changes = replace(changes, to_axes=None)  # the format's writer makes the change
         options = _with_axes(options, defined, output, NAMED_AXES.get(to_axes) or cast("Axes", to_axes))
     run.begin("read")
-    whole = read_merged(scenes, from_axes, run.render_model, run.say)
+    whole = read_merged(opened, points, from_axes, **run.callbacks)
     splats, read = changes.apply(whole), len(whole)
     if as_table:
         run.begin("write")

@@ -31,6 +31,7 @@ from g2ard.io import Source
     scenes=True,
     budgets=True,
     tiles=True,
+    points=True,
 )
 def distill(
     run: Run,
@@ -112,6 +113,7 @@ def distill(
     refuse_file(output, f"the scene in it is scene.{format}")
     run.claim("--output", output, folder=True)
     source = None if scene is None else Source(scene, run.render_model, others or ())
+    opt.choose_points(run, source)
     folder = RunFolder(run, output, f"scene.{format}", resume)
     if not dry_run and (finished := folder.check(budget)):
         drop_work(tiling_of(run, source, output))

@@ -15,7 +15,7 @@ from g2ard.cli.run import Run
 from g2ard.config.choices import BLACK, LpipsInput
 from g2ard.errors import InputError
 from g2ard.io import Source
-from g2ard.io.labels import names_of
+from g2ard.report.labels import names_of
 
 if TYPE_CHECKING:
     from g2ard.jobs.inputs import Views

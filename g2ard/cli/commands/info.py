@@ -75,7 +75,7 @@ def _described(given: ViewFiles) -> tuple[dict[str, Any], list[list[str]]]:
     from g2ard.cli.run_folder import stopped_run
     from g2ard.io.describe import describe
     from g2ard.io.jsonfile import read_json
-    from g2ard.io.labels import RESULT
+    from g2ard.report.labels import RESULT
 
     path = given.path
     if (stopped := stopped_run(path)) is not None:

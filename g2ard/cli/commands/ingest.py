@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     example="g2ard ingest city.ply -o tiles/ --tile-rows 2M",
     settings="g2ard.stages.lift:LiftConfig",
     scenes=True,
+    points=True,
     without=("seed",),
 )
 def ingest(
@@ -50,14 +51,16 @@ def ingest(
     from g2ard.tiles.ingest import TILE_ROWS
     from g2ard.tiles.ingest import ingest as into_tiles
 
+    source = Source(scenes[0], run.render_model, scenes[1:])
+    opt.choose_points(run, source)
     if dry_run:
-        _tell_plan(run, Source(scenes[0], run.render_model, scenes[1:]), tile_rows)
+        _tell_plan(run, source, tile_rows)
         return
     refuse_file(output, "tiles")
     run.claim("--output", output, folder=True)
     began = time.perf_counter()
     store = into_tiles(
-        scenes,
+        source,
         output,
         tile_rows=TILE_ROWS if tile_rows is None else int(tile_rows.value),
         lift=run.settled(LiftConfig())[1],

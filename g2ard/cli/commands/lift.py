@@ -6,15 +6,15 @@ from typing import Annotated
 
 import typer
 
-from g2ard import io
 from g2ard.cli.command import command
-from g2ard.cli.options import OutputOption
+from g2ard.cli.options import OutputOption, choose_points
 from g2ard.cli.run import Run
 from g2ard.cli.run_result import say_weight
+from g2ard.io import Source
 from g2ard.progress import plural
 
 
-@command("lift", example="g2ard lift stadium.laz -o prior.ply", without=("seed",))
+@command("lift", example="g2ard lift stadium.laz -o prior.ply", points=True, without=("seed",))
 def lift(
     run: Run,
     cloud: Annotated[
@@ -37,7 +37,9 @@ def lift(
     run.claim_scene("--output", output)
     began = time.perf_counter()
     run.begin("read")
-    found = io.read_cloud(cloud)
+    source = Source(cloud)
+    choose_points(run, source)
+    found = source.cloud().whole()
     for note in found.notes:
         run.say(f"{cloud}: {note}")
     read = time.perf_counter()

@@ -27,7 +27,9 @@ if TYPE_CHECKING:
     from g2ard.scene.splats import Splats
 
 
-@command("lod", example="g2ard lod scene.ply -r 1,2,4,8,16 -o streamed/", scenes=True, tiles=True)
+@command(
+    "lod", example="g2ard lod scene.ply -r 1,2,4,8,16 -o streamed/", scenes=True, tiles=True, points=True
+)
 def lod(
     run: Run,
     scene: Annotated[
@@ -150,6 +152,7 @@ def lod(
 
     refuse_file(output, "levels of detail")
     source = Source(scene, run.render_model, others or ())
+    opt.choose_points(run, source)
     if not recover:
         run.refuse_typed("with --merge-only", "steps")
     with run.usage():

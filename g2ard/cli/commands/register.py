@@ -158,7 +158,7 @@ def register(
     if len(found.cameras):
         run.write_views(output, found.cameras, format)
     if report is not None:
-        from g2ard.io.labels import names_of
+        from g2ard.report.labels import names_of
 
         title = f"Photos in {names_of([scene])[0]}"
         with run.showing("--report"):

@@ -19,9 +19,9 @@ from g2ard.config.choices import is_made
 from g2ard.config.schema import listed
 from g2ard.io import Source
 from g2ard.io.atomic import atomic_output
-from g2ard.io.labels import counted
 from g2ard.io.scene_formats import written_bytes
 from g2ard.progress import plural
+from g2ard.report.labels import counted
 from g2ard.system.peak_memory import peak_rss_of_all
 
 if TYPE_CHECKING:
@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     budgets=True,
     several=True,
     tiles=True,
+    points=True,
     outputs=("output", "parents"),
 )
 def simplify(
@@ -86,6 +87,7 @@ def simplify(
     if given_views or no_views or config.method == "paper" or (config.method == "fast" and views is None):
         run.refuse_typed("without generated views", "up")
     source = Source(scene, run.render_model, others or ())
+    opt.choose_points(run, source)
     tiling = tiling_of(run, source, output)
     given = opt.with_images(views, images)
     name = "scene.ply" if output == opt.UNWRITTEN else output.name

@@ -13,7 +13,7 @@ from g2ard.cli import options as opt
 from g2ard.cli.command import command
 from g2ard.cli.run import Run
 from g2ard.io import Source
-from g2ard.io.labels import labels_of
+from g2ard.report.labels import labels_of
 
 _LARGEST_DENSE = 2_000_000
 """Largest dense scene that is shown beside a run's result."""

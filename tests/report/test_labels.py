@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from g2ard.io import Source
-from g2ard.io.labels import labels_of, names_of
+from g2ard.report.labels import labels_of, names_of
 from helpers.photos import cloud_of
 from helpers.scenes import checkered_ball
 
