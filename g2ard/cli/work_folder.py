@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from g2ard.jobs.tile_options import Tiling
 
 
-_WORK_NAME = re.compile(r"tiles|steps|(student|merged|level|written)-[0-9a-f]{16}")
+_WORK_NAME = re.compile(r"tiles|steps|(cleaned|merged|level|written)-[0-9a-f]{16}")
 """Names that commands create in the work folder."""
 
 

@@ -3,6 +3,7 @@
 import struct
 from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -35,11 +36,14 @@ class Stream(HeldPoints):
                 raise InputError("has no points3D.bin or points3D.txt", path=model_folder(path) or path)
             path = file
         with parsing(path):
-            numbers = numbers_of(path.parent, names) if names else set()
-            rows = (_binary if path.suffix.lower() == ".bin" else _text)(path, numbers)
+            self._numbers = numbers_of(path.parent, names) if names else set()
+            rows = (_binary if path.suffix.lower() == ".bin" else _text)(path, self._numbers)
         whole = (rows[:, 3:] == np.rint(rows[:, 3:])).all()
         super().__init__(path, rows[:, :3], rows[:, 3:], (255.0,) if whole else (1.0, 255.0))
         self.axes = self.axes or "RDF"
+
+    def identity(self) -> list[Any]:
+        return [*super().identity(), *sorted(self._numbers)]
 
 
 def _binary(path: Path, numbers: set[int]) -> Float:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -13,6 +14,8 @@ from g2ard.config.checks import checks_arguments
 from g2ard.config.choices import RenderModel
 from g2ard.errors import InputError, require
 from g2ard.jobs.inputs import load_scene
+from g2ard.jobs.run_views import pool_times
+from g2ard.pipeline.dense import Dense, InMemory
 from g2ard.poses import plan_pool
 from g2ard.progress import Progress, Say, plural, silent, unsaid
 from g2ard.rendering.visibility import visibility
@@ -113,15 +116,7 @@ def clean(
         )
     if not kinds:
         return Cleaned(splats, Cleaning(np.full(len(splats), -1, np.int8)), sky, None)
-    pool = plan_pool(
-        splats,
-        _CLUTTER_VIEWS,
-        seed=seed,
-        rows=_CLUTTER_ROWS,
-        near=_CLUTTER_NEAR,
-        progress=progress,
-    )
-    cameras = pool.cameras.resized(_CLUTTER_SIDE)
+    cameras = _views(splats, seed, progress)
     seen = visibility(splats, cameras, progress)
     pixels = int((cameras.widths.astype(int) * cameras.heights).sum())
     unoccluded, floating = compare_depths(
@@ -130,11 +125,39 @@ def clean(
     clutter = find_clutter(
         splats, seen, unoccluded, pixels, kinds, floating=floating, strength=strength, progress=progress
     )
-    parts = [f"{count:,} {name}" for name, count in clutter.counts.items() if name in kinds]
-    gone = len(splats) - int(clutter.keep.sum())
-    light = f"{seen.weight[~clutter.keep].sum() / max(seen.weight.sum(), 1e-30):.1%} of the light"
-    say(f"{gone:,} of {plural(len(splats), 'Gaussian')} are clutter, with {light}: {', '.join(parts)}")
+    _tell(clutter, seen.weight[~clutter.keep].sum() / max(seen.weight.sum(), 1e-30), kinds, say)
     return Cleaned(splats, clutter, sky, cameras)
+
+
+def _views(splats: Splats, seed: int, progress: Progress, represents: float = 1.0) -> Cameras:
+    """Return generated views that show clutter; `represents` is that of `plan_pool`."""
+    count = round(_CLUTTER_VIEWS * pool_times(represents * len(splats))) if represents > 1 else _CLUTTER_VIEWS
+    how: dict[str, Any] = {"rows": _CLUTTER_ROWS, "near": _CLUTTER_NEAR, "represents": represents}
+    return plan_pool(splats, count, seed=seed, progress=progress, **how).cameras.resized(_CLUTTER_SIDE)
+
+
+def _tell(clutter: Cleaning, light: float, kinds: Sequence[str], say: Say) -> None:
+    parts = [f"{count:,} {name}" for name, count in clutter.counts.items() if name in kinds]
+    gone = len(clutter.kind) - int(clutter.keep.sum())
+    whole = plural(len(clutter.kind), "Gaussian")
+    say(f"{gone:,} of {whole} are clutter, with {light:.1%} of the light: {', '.join(parts)}")
+
+
+def without_clutter(
+    dense: Dense, *, seed: int = 0, progress: Progress = silent, say: Say = unsaid
+) -> tuple[Dense, dict[str, int]]:
+    """Return a dense scene without its clutter, and the number of Gaussians removed by kind."""
+    from g2ard.tiles.dense import InTiles
+
+    if isinstance(dense, InTiles):
+        cameras = _views(dense.sample, seed, progress, dense.total / len(dense.sample))
+        rest, clutter, light = dense.without_clutter(cameras)
+        _tell(clutter, light, kinds_of(None, 0), say)
+        return rest, clutter.counts
+    if dense.total > len(dense.sample):  # in tiles that are only planned
+        return dense, {}
+    done = clean(dense.sample, seed=seed, progress=progress, say=say)
+    return InMemory(done.splats), done.clutter.counts
 
 
 def kinds_of(only: Sequence[str] | None, strength: float) -> tuple[str, ...]:

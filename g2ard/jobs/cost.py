@@ -18,6 +18,7 @@ from g2ard.io.tile_store import row_width
 from g2ard.jobs.distill_options import LEAST_RECOVERY_SHARE
 from g2ard.jobs.memory import RECOVERY_TIMES, TileMemory, TilePlan, amount
 from g2ard.jobs.run_views import within_pixels
+from g2ard.pipeline.distill import round_counts
 from g2ard.progress import plural
 from g2ard.rendering.targets import CACHE_BYTES
 from g2ard.system.threads import threads_used
@@ -228,6 +229,7 @@ def _tiled_stages(plan: TilePlan, views: int, *, gaps: bool) -> list[tuple[str, 
 def _peak_bytes(job: Any, count: int, steps: int, page: bool) -> int:
     """Return the peak memory: of simplification, of recovery, or of what is written at the end."""
     given, views, train = job.config.recover.sh_degree, job.views, job.views.train.cameras
+    count = round_counts(job.dense, count, job.config)[0]
     degree = job.prior.sh_degree if given is None else given
     dense, scene, small = len(job.prior), job.prior.nbytes, 4 * row_width(degree) * count
     rows = 0 if job.plan else dense  # that view.html may show

@@ -13,11 +13,12 @@ from g2ard.errors import InputError
 from g2ard.io.sanitize import BLOCK
 from g2ard.io.source import Source
 from g2ard.io.stream import PointStream, SceneStream
-from g2ard.io.types import Note
+from g2ard.io.types import Note, ViewSet
 from g2ard.jobs.memory import TilePlan, plan_tiles
 from g2ard.jobs.tile_options import Tiling
 from g2ard.pipeline.dense import Dense, InMemory
 from g2ard.progress import Progress, Say, silent, unsaid
+from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats
 from g2ard.scene.transform import join
 from g2ard.stages.lift import LiftConfig, lift
@@ -30,9 +31,19 @@ if TYPE_CHECKING:
 
 @dataclass(eq=False)
 class Planned(InMemory):
-    """A scene in tiles that are only planned: a sample, and the number of all its Gaussians."""
+    """A scene in tiles that are only planned: a sample, and the number of all its Gaussians.
+
+    Args:
+        tile_rows: most Gaussians of a tile.
+    """
 
     count: int = 0
+    tile_rows: int = 0
+
+    @property
+    def most_rows(self) -> float:  # type: ignore[override]
+        """Largest count that is merged into memory."""
+        return self.tile_rows
 
     @property
     def total(self) -> int:
@@ -47,11 +58,13 @@ class Opened:
     Args:
         plan: of its tiles.
         notes: on its file, once it has been read.
+        views: for points with photos, those to learn from and those to score.
     """
 
     dense: Dense
     plan: TilePlan
     notes: tuple[Note, ...] = ()
+    views: tuple[ViewSet, Cameras] | None = None
 
 
 @contextmanager
@@ -96,7 +109,7 @@ def opened(
     plan = plan_tiles(store or stream, tiling, times)
     say(f"{plan.tiles:,} tiles of {plan.count:,} Gaussians, {plan.workers} at a time")
     if planned or store is None:
-        yield Opened(Planned(_sampled(stream, lifting), count=plan.count), plan)
+        yield Opened(Planned(_sampled(stream, lifting), count=plan.count, tile_rows=tiling.most_rows), plan)
         return
     threads = max(1, tiling.usable_cores // plan.workers)
     with executor(plan.workers, threads, tiling.scheduler) as runs:

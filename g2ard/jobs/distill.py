@@ -18,25 +18,33 @@ from g2ard.config.choices import Colour, FormatName, PointColor, RenderModel, is
 from g2ard.config.schema import keywords, listed
 from g2ard.errors import InputError
 from g2ard.io import Source, read_splats
-from g2ard.io.paths import real_path
 from g2ard.io.types import Cloud, Points, ViewSet
 from g2ard.jobs.budget import Budget, count_of
 from g2ard.jobs.budget_search import ResolvedBudget
 from g2ard.jobs.chosen_points import PointChoice
-from g2ard.jobs.clean import clean as remove_clutter
+from g2ard.jobs.clean import without_clutter
 from g2ard.jobs.distill_options import LEAST_RECOVERY_SHARE, DistillOptions
 from g2ard.jobs.doubts import doubts_of_regions, doubts_of_views
 from g2ard.jobs.inputs import GivenViews, Views, axes_of, load_scene, make_targets, scorable, split_views
 from g2ard.jobs.memory import RECOVERY_TIMES, TilePlan
 from g2ard.jobs.photo_colors import colored
-from g2ard.jobs.photo_points import distinct, placed_by, sparse_file, sparse_points, topped_up, usual_count
+from g2ard.jobs.photo_points import (
+    distinct,
+    is_sparse_file,
+    placed_by,
+    placed_source,
+    sparse_file,
+    sparse_points,
+    topped_up,
+    usual_count,
+)
 from g2ard.jobs.run_views import Use, is_untouched, pool_times, views_of, within_pixels
 from g2ard.jobs.simplify import Reduction
 from g2ard.jobs.view_checks import check_photos, propose_background
 from g2ard.jobs.viewer_frame import best_level
 from g2ard.pipeline.config import DistillConfig
 from g2ard.pipeline.dense import Dense, InMemory
-from g2ard.pipeline.distill import Distilled, RunViews
+from g2ard.pipeline.distill import Distilled, RunViews, round_counts
 from g2ard.pipeline.distill import distill as pipeline
 from g2ard.poses import best_views
 from g2ard.progress import Detail, Progress, Say, plural, silent, unsaid
@@ -151,12 +159,10 @@ class DistillJob:
 
     def steps(self, count: int) -> int:
         """Return the steps of all recoveries: after each round, if there are rounds, and of the last."""
-        recover, simplify = self.config.recover, self.config.simplify
+        recover = self.config.recover
         like = self.prior.take(np.array(evenly_spaced(len(self.prior), min(count, len(self.prior)))))
         last = recover.final_steps(like, self.views.train.cameras, of_photos=self.reads_photos)
-        if not recover.schedule.round_steps:
-            return last
-        rounds = simplify.rounds(self.total, count, recovered=True)
+        rounds = round_counts(self.dense, count, self.config)
         return last + len(rounds) * recover.schedule.round_steps
 
     @property
@@ -569,11 +575,17 @@ def preparing(
     began = time.monotonic()
     if scene.kind == "splats":
         options.check_trained()
-    config, source = options.config, scene.drawn_as(options.render_model)
+    config, source, parts = options.config, scene.drawn_as(options.render_model), None
+    views = None if is_made(options.views) or options.photos is False else options.views
+    if scene.kind == "points" and views is not None:
+        parts = split_views(views, options.held_out, say)
+        if not scene.others and is_sparse_file(scene, views):
+            source = placed_source(scene, parts[0].cameras)
     with opened(
         source, tiling, RECOVERY_TIMES, config.simplify, config.lift, planned=planned, **callbacks
     ) as tiles:
-        yield prepare(scene, budget, options, tiles, use=use, began=began, **callbacks)
+        given = replace(tiles, views=parts)
+        yield prepare(scene, budget, options, given, use=use, began=began, **callbacks)
 
 
 def prepare(
@@ -604,14 +616,13 @@ def prepare(
     if tiles is None:
         read = _read(scene, budget, options, progress, say)
     else:
-        read = _in_tiles(scene, options, tiles, say)
+        read = _in_tiles(scene, options, tiles)
     if read.cloud and not read.needs_photos:
         say(_NO_PHOTOS)
     budget = budget or Budget(count=read.usual)
     dense, cleaned = read.dense, None
     if options.clean:
-        done = remove_clutter(dense.sample, seed=recover.seed, progress=progress, say=say)
-        dense, cleaned = InMemory(done.splats), done.clutter.counts
+        dense, cleaned = without_clutter(dense, seed=recover.seed, progress=progress, say=say)
     prior, total = dense.sample, dense.total
     default_degree = 3 if read.needs_photos else None  # points have one colour each, photos show more
     degree = options.configured(sh_degree=default_degree).recover.sh_degree
@@ -834,20 +845,13 @@ def _read(
     return _Read(InMemory(lifted), True, True, options.beside, name, given, of_photos, usual, parts)
 
 
-def _in_tiles(scene: Given, options: DistillOptions, tiles: Opened, say: Say) -> _Read:
+def _in_tiles(scene: Given, options: DistillOptions, tiles: Opened) -> _Read:
     """Describe a scene in tiles, or the lift of a point cloud."""
     assert isinstance(scene, Source)
-    cloud = scene.kind == "points"
-    views = None if is_made(options.views) or options.photos is False else options.views
-    return _Read(
-        tiles.dense,
-        cloud,
-        cloud and views is not None,
-        options.beside or (None if cloud else scene.path),
-        str(scene),
-        len(tiles.dense.sample),
-        views=split_views(views, options.held_out, say) if cloud and views is not None else None,
-    )
+    cloud, given = scene.kind == "points", len(tiles.dense.sample)
+    beside = options.beside or (None if cloud else scene.path)
+    of_photos = tiles.views is not None
+    return _Read(tiles.dense, cloud, of_photos, beside, str(scene), given, views=tiles.views)
 
 
 def _points(
@@ -862,8 +866,7 @@ def _points(
     sparse = None if views is None else sparse_file(views)
     if scene is None:
         return sparse_points(sparse, say, train), "cloud" if sparse is None else str(sparse), True
-    given = (scene.kind == "views" and sparse_file(scene.path)) or scene.path
-    of_photos = sparse is not None and real_path(given) == real_path(sparse)
+    of_photos = views is not None and is_sparse_file(scene, views)
     if sparse is not None and of_photos and train is not None:
         cloud = placed_by(train, sparse)
     else:

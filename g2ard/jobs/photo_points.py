@@ -16,11 +16,13 @@ from numpy.typing import NDArray
 
 from g2ard.config.choices import BLACK, Colour
 from g2ard.errors import G2ardError, InputError
-from g2ard.io import read_cloud
+from g2ard.io import Source, read_cloud
 from g2ard.io.detect import file_format
 from g2ard.io.finding import Finder
 from g2ard.io.images import composited, load_photo
 from g2ard.io.jsonfile import read_json
+from g2ard.io.paths import real_path
+from g2ard.io.stream import PointStream
 from g2ard.io.types import Cloud, Points, ViewFiles
 from g2ard.jobs.inputs import Views
 from g2ard.progress import Progress, Say, plural, silent, unsaid
@@ -240,11 +242,30 @@ def distinct(points: Points) -> Points:
 
 def placed_by(train: Cameras, file: Path) -> Cloud:
     """Read the points of `sparse_file` that training views see, as far as the file states who does."""
-    if file.stem.lower() != "points3d":
-        return read_cloud(file, bare=True)
+    return placed_source(Source(file), train).cloud(bare=True).whole()
+
+
+def placed_source(scene: Source, train: Cameras) -> Source:
+    """Return points without those that the file says fewer than two training views see."""
+    if scene.format != "points3d":
+        return scene
     from g2ard.io import points3d
 
-    return points3d.Stream(file, train.names).whole()
+    placed, chosen = Source(scene.path), scene.through
+
+    def through(stream: PointStream) -> PointStream:
+        seen = points3d.Stream(stream.path, train.names)
+        return chosen(seen) if chosen else seen
+
+    placed.through = through
+    return placed
+
+
+def is_sparse_file(scene: Source, views: Views) -> bool:
+    """Return whether points are those of `sparse_file`."""
+    file = sparse_file(views)
+    given = (scene.kind == "views" and sparse_file(scene.path)) or scene.path
+    return file is not None and real_path(given) == real_path(file)
 
 
 def sparse_points(file: Path | None, say: Say = unsaid, train: Cameras | None = None) -> Cloud | None:

@@ -1,21 +1,14 @@
-"""When a scene is processed in tiles, and which options tiles reject."""
+"""When a scene is processed in tiles, and how."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from g2ard.errors import InputError
 from g2ard.io.source import Source
-from g2ard.stages.simplify import Default, SimplifyConfig
 from g2ard.system.memory import usable_memory
 from g2ard.tiles.ingest import TILE_ROWS
-
-if TYPE_CHECKING:
-    from g2ard.pipeline.config import DistillConfig
 
 _LEAST_ROW_BYTES = 4
 """Least bytes per Gaussian in a file: a smaller file is known to be small without opening it."""
@@ -77,52 +70,3 @@ def is_tiled(source: Source, tiling: Tiling) -> bool:
     if source.kind == "splats" and source.store is not None:
         return len(source.store.tiles) > 1
     return source.kind != "views" and source.count > most
-
-
-def refuse_whole(source: Source, options: Sequence[str]) -> None:
-    """Reject options, such as those of `needs_whole`, for a scene in tiles."""
-    if not options:
-        return
-
-    one = cut_into(None if source.store is None else source.path, source.count)
-    takes = "needs" if len(options) == 1 else "need"
-    raise InputError(
-        f"{' and '.join(options)} {takes} the whole scene in memory, but it is processed in tiles; "
-        f"use {one} for one piece",
-        path=source.path,
-    )
-
-
-def needs_whole(
-    config: SimplifyConfig | DistillConfig, preset: str | None = None, **options: object
-) -> list[str]:
-    """Return what needs the whole scene in memory, as options.
-
-    Tiles merge by the method `default`, all together along Morton order in one step. The paper's method and
-    rounds with recovery begin with most of the scene's Gaussians.
-
-    Args:
-        config: of a simplification or a distillation.
-        preset: from which the config may come.
-        options: options of the command that need the whole scene if they are given.
-
-    >>> from g2ard.stages.simplify import SimplifyConfig
-    >>> needs_whole(SimplifyConfig(), clean=False)
-    []
-    >>> needs_whole(SimplifyConfig("fast"), clean=True)
-    ['--method fast', '--clean']
-    """
-    distill = None if isinstance(config, SimplifyConfig) else config
-    simplify = config if isinstance(config, SimplifyConfig) else config.simplify
-    usual, given = Default().resolved().morton_premerge_steps, {}
-    if preset is not None and preset.startswith("paper"):
-        given[f"--preset {preset}"] = True
-    else:
-        given[f"--method {simplify.method}"] = simplify.method != "default"
-        if distill is not None:
-            given["--schedule paper"] = distill.recover.schedule.round_steps > 0
-        if isinstance(simplify, Default):
-            steps = simplify.morton_premerge_steps
-            given["--set simplify.morton_premerge_steps"] = steps not in (None, usual)
-    given |= {f"--{name.replace('_', '-')}": bool(value) for name, value in options.items()}
-    return [option for option, is_given in given.items() if is_given]

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,12 +41,15 @@ class Dense(Protocol):
     Attributes:
         sample: some of its Gaussians, on which views are planned and constants chosen, or all.
         total: number of its Gaussians.
+        most_rows: a scene that is merged to at most so many Gaussians is in memory.
     """
 
     @property
     def sample(self) -> Splats: ...
     @property
     def total(self) -> int: ...
+    @property
+    def most_rows(self) -> float: ...
 
     def identity(self) -> list[str]:
         """Return what identifies the Gaussians that are not in the sample."""
@@ -82,6 +86,7 @@ class InMemory:
     """A dense scene in memory."""
 
     splats: Splats
+    most_rows: ClassVar[float] = math.inf
     _sources: dict[int, tuple[Cameras, VisibilitySource]] = field(default_factory=dict, metadata=UNKEYED)
 
     @property

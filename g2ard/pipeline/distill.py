@@ -119,7 +119,8 @@ def distill(
     """Distil a dense prior into exactly `budget` Gaussians.
 
     The scene is simplified in one step, or, if the schedule has `round_steps`, in rounds of N_r = max(N_S,
-    ⌈0.75·N_{r−1}⌉) with recovery after each.
+    ⌈0.75·N_{r−1}⌉) with recovery after each. Of a scene in tiles, the first round merges to the largest of
+    these counts that a tile may have.
 
     Args:
         prior: a trained scene or a lifted point cloud, in memory or in tiles; cameras are in world
@@ -148,9 +149,8 @@ def distill(
     dense = as_dense(prior)
     if validation is not None:
         validation = checked_targets(validation, "validation")
-    schedule, counts, steps = config.recover.schedule, [budget], Steps(work, progress)
-    if schedule.round_steps > 0:
-        counts = config.simplify.rounds(dense.total, budget, recovered=True)
+    schedule, steps = config.recover.schedule, Steps(work, progress)
+    counts = round_counts(dense, budget, config)
     given = checked_weights(weights, len(targets.cameras))
     photos = isinstance(targets, Photos | PhotosOrRenders)
     total, protected, selecting, log = dense.total, None, 0.0, []
@@ -201,6 +201,14 @@ def distill(
         resumed=steps.resumed,
     )
     return Distilled(scene, simplified, DistillReport(tuple(log), seconds, views))
+
+
+def round_counts(dense: Dense, budget: int, config: DistillConfig) -> list[int]:
+    """Return the count after each round. Those that memory does not hold are passed over."""
+    if not config.recover.schedule.round_steps:
+        return [budget]
+    counts = config.simplify.rounds(dense.total, budget, recovered=True)
+    return [count for count in counts if count <= dense.most_rows and count > budget] + [budget]
 
 
 def selected(

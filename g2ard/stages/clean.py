@@ -12,6 +12,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -76,6 +77,7 @@ def find_clutter(
     *,
     floating: _Floating | None = None,
     strength: float = 0.0,
+    extent: tuple[Sequence[float], float] | None = None,
     progress: Progress = silent,
 ) -> Cleaning:
     """Find Gaussians to remove; one of several kinds gets the first in the order of `KINDS`.
@@ -87,6 +89,7 @@ def find_clutter(
         pixels: number of pixels of all views together.
         floating: from `compare_depths`; None finds neither haze nor streaks.
         strength: 0 to 1: haze and streaks float in more than 1 − `strength` of the views.
+        extent: `extent_of` the whole scene, if these are a part of it.
 
     Raises:
         InputError: an unknown kind, or `seen` or `unoccluded` of another length.
@@ -99,7 +102,7 @@ def find_clutter(
     hidden = _invisible(splats, seen, unoccluded, pixels)
     finders = {
         "invisible": lambda rest: hidden,
-        "giant": lambda rest: _giants(splats),
+        "giant": lambda rest: _giants(splats, *(extent or extent_of(splats))),
         "needle": lambda rest: _needles(splats, rest, progress),
         "floater": lambda rest: _floaters(splats, rest, seen.weight, unoccluded, progress),
     }
@@ -194,13 +197,18 @@ def _in_frame(
     return rows, z[rows], depths[v[rows].astype(int), u[rows].astype(int)]
 
 
-def _giants(splats: Splats) -> NDArray[np.bool_]:
-    """Mark Gaussians larger than the radius of 99 % of the means, with the median mean within 3σ."""
+def extent_of(splats: Splats) -> tuple[list[float], float]:
+    """Return the median of the means, and the radius around it that holds 99 % of them."""
     means = splats.means.astype(np.float64)
     middle = np.median(means, axis=0)
-    radius = float(np.percentile(np.linalg.norm(means - middle, axis=1), 99))
+    return middle.tolist(), float(np.percentile(np.linalg.norm(means - middle, axis=1), 99))
+
+
+def _giants(splats: Splats, middle: Sequence[float], radius: float) -> NDArray[np.bool_]:
+    """Mark Gaussians larger than the scene, with its middle within 3σ."""
+    means = splats.means.astype(np.float64)
     large = np.flatnonzero(splats.scales.max(axis=1) > radius)
-    local = np.einsum("nji,nj->ni", rotation_matrices(splats.quats[large]), middle - means[large])
+    local = np.einsum("nji,nj->ni", rotation_matrices(splats.quats[large]), np.asarray(middle) - means[large])
     local /= np.maximum(splats.scales[large].astype(np.float64), 1e-30)
     out = np.zeros(len(splats), bool)
     out[large[np.linalg.norm(local, axis=1) <= _FOOTPRINT_SIGMAS]] = True

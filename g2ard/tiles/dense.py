@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g2ard.config.choices import BLACK, Colour
-from g2ard.io.stream import PartsStream
+from g2ard.io.sanitize import BLOCK
+from g2ard.io.stream import PartsStream, SceneStream
 from g2ard.io.tile_store import TileStore
 from g2ard.pipeline.dense import InMemory
 from g2ard.progress import Progress, silent
@@ -24,15 +25,17 @@ from g2ard.rendering.visibility import LONGEST, usual_and_others
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats
 from g2ard.scene.transform import stand_as
-from g2ard.stages.simplify import SimplifyConfig
+from g2ard.stages.clean import Cleaning, extent_of
+from g2ard.stages.simplify import Default, SimplifyConfig
 from g2ard.stages.simplify.gaps import let_through, some_views
 from g2ard.stages.simplify.pairs import MANY
 from g2ard.stages.simplify.reduce import SimplifyReport
 from g2ard.system.cached import cached_property
+from g2ard.system.keys import key_of
 from g2ard.tiles.executor import Workers
 from g2ard.tiles.ingest import ingest
-from g2ard.tiles.merging import simplify_tiles
-from g2ard.tiles.sights import written
+from g2ard.tiles.merging import scene_in_tiles, simplify_tiles
+from g2ard.tiles.sights import boxes_of, levels_of, written
 from g2ard.tiles.simplify import TiledRun
 from g2ard.tiles.tasks import Task, load
 
@@ -45,11 +48,43 @@ _KEPT_BYTES = 500_000_000
 
 @dataclass(frozen=True, eq=False)
 class MergedTiles:
-    """A scene merged in tiles, and a report."""
+    """A scene merged in tiles, and a report.
+
+    Args:
+        files: that have the `parents` of each tile's rows; none if nothing was merged.
+    """
 
     splats: Splats | PartsStream
     report: SimplifyReport
-    protected: NDArray[np.bool_] | None = None
+    store: TileStore
+    files: Sequence[Path]
+
+    @property
+    def protected(self) -> NDArray[np.bool_] | None:
+        """(M,) protection flags, if the method has them."""
+        flags = [load(path, "protected")[0] for path in self.files if path.name.startswith("reduce")]
+        return np.concatenate(flags) if flags else None
+
+    def parents(self, scene: SceneStream) -> NDArray[np.int64]:
+        """Return (N,) the row in the result of each Gaussian, see `Simplified`.
+
+        Args:
+            scene: what was cut into the tiles, or they themselves: it gives the order of the rows.
+        """
+        rows = [tile.rows for tile in self.store.tiles]
+        counts = self.report.tiles or rows
+        parents = [load(path, "parents")[0] for path in self.files] or [np.arange(n) for n in rows]
+        before = np.cumsum([0, *counts])[:-1]
+        moved = [np.where(own < 0, -1, own + np.int64(n)) for own, n in zip(parents, before, strict=True)]
+        if scene.identity() == [self.store.key]:
+            return np.concatenate(moved)
+        out, done, begin = np.empty(self.store.count, np.int64), [0] * len(rows), 0
+        for block in scene.blocks(BLOCK):
+            for tile, (core, _) in enumerate(self.store.tree.route(block.means)):
+                out[begin + core] = moved[tile][done[tile] : done[tile] + len(core)]
+                done[tile] += len(core)
+            begin += len(block)
+        return out
 
 
 @dataclass(eq=False)
@@ -110,21 +145,22 @@ class InTiles:
     ) -> MergedTiles:
         """Merge the scene, see `Dense`; finished steps are in the folder of the workers.
 
-        `protected` and `final_budget` serve the method `paper`, which needs the whole scene in memory.
-        Colours are fitted, and gaps measured, only if the result is in memory.
+        Flags of `protected` are those of a round before, of which a scene in tiles has none. Colours are
+        fitted, and gaps measured, only if the result is in memory.
         """
-        done = simplify_tiles(self._run, count, views)
+        done = simplify_tiles(self._run, count, views, final_budget)
+        merged = MergedTiles(done.splats, done.report, self.store, done.files)
         if count > self.most_rows:
-            return MergedTiles(done.splats, done.report)
+            return merged
         small, report = done.splats.whole(), done.report
         if views is None or count == self.total:
-            return MergedTiles(small, report)
+            return replace(merged, splats=small)
         usual = usual_and_others(views)[0].resized(LONGEST)
-        if self.total >= MANY * count:
+        if isinstance(config, Default) and self.total >= MANY * count:
             small = self._recoloured(small, usual, progress)
         if gaps:
             report = replace(report, opacity_lost=self.opacity_lost(small, usual))
-        return MergedTiles(small, report)
+        return replace(merged, splats=small, report=report)
 
     def _recoloured(self, small: Splats, views: Cameras, progress: Progress) -> Splats:
         chosen = seen_by(views)
@@ -151,6 +187,28 @@ class InTiles:
         ]
         lost, opaque = np.sum(pairs, axis=0)
         return float(lost / opaque) if opaque else 0.0
+
+    def without_clutter(self, views: Cameras) -> tuple[InMemory | InTiles, Cleaning, float]:
+        """Return the scene without the clutter that views show, what that is, and its share of the light."""
+        run, extent = self._run, extent_of(self.sample)
+        boxes, shown = boxes_of(run.coarse), written(self.workers.folder, views)
+        files = run.each(
+            "clutter",
+            "clutter",
+            per_tile=[{"levels": levels_of(boxes, tile), "extent": extent} for tile in range(len(boxes))],
+            inputs=[{"coarse": run.coarse, "views": shown}] * len(boxes),
+            module="g2ard.tiles.clutter",
+        )
+        found = [Cleaning(load(path, "kind")[0]) for path in files]
+        light, gone = np.sum([load(path, "light")[0] for path in files], axis=0)
+
+        def cleaned(tile: int) -> Splats:
+            return self.store.read(tile).take(found[tile].keep)
+
+        counts = [int(np.count_nonzero(one.keep)) for one in found]
+        scene = scene_in_tiles(self.store, counts, cleaned, key_of(files), self.store.sh_degree)
+        kinds = Cleaning(np.concatenate([one.kind for one in found]))
+        return self.derived(scene, "cleaned"), kinds, float(gone / max(light, 1e-30))
 
     def derived(self, scene: Splats | PartsStream, name: str) -> InMemory | InTiles:
         """Return a scene that was derived from this one: in memory, or in tiles of its own if it is large."""

@@ -1,7 +1,8 @@
 """Simplification of a tiled scene to one exact budget."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
+from itertools import accumulate, pairwise
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from g2ard.io.stream import PartsStream
 from g2ard.io.tile_store import TileStore
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats, unit_quats
+from g2ard.stages.simplify import Paper
 from g2ard.stages.simplify.pairs import fit_opacities
 from g2ard.stages.simplify.reduce import SimplifyReport, SimplifyRound
 from g2ard.system.keys import key_of
@@ -32,14 +34,18 @@ class Merged:
 
     Args:
         splats: the scene, with fitted opacities; its identity is a hash of the names of its files.
+        files: results of `merge` or `reduce`; none if nothing was merged.
     """
 
     splats: PartsStream
     report: SimplifyReport
+    files: Sequence[Path] = ()
 
 
-def simplify_tiles(run: TiledRun, budget: int, views: Cameras | None = None) -> Merged:
-    """Reduce a tiled scene to exactly `budget` Gaussians with method `default`.
+def simplify_tiles(
+    run: TiledRun, budget: int, views: Cameras | None = None, final_budget: int | None = None
+) -> Merged:
+    """Reduce a tiled scene to exactly `budget` Gaussians; `final_budget` is that of `simplify`.
 
     If `budget` is the scene's count, the scene is returned unchanged. Otherwise:
 
@@ -48,7 +54,9 @@ def simplify_tiles(run: TiledRun, budget: int, views: Cameras | None = None) -> 
        tiles (`Sights`).
     3. Each tile computes the costs of merging along Morton order. The cheapest merges of all tiles are done,
        down to three times the budget. Then each tile plans more merges of pairs than needed, and the cheapest
-       of all plans are done, down to the budget (`_merged`).
+       of all plans are done, down to the budget (`_merged`). Where merging has several steps along Morton
+       order, as in `fast`, the cheapest merges only decide the share that each tile keeps, with `paper` its
+       rows do; then it is reduced by itself.
     4. Opacities are fitted to what the same views see of the result.
 
     Every step is a task with a file in the folder of the run's workers, so the same call resumes. The result
@@ -64,7 +72,11 @@ def simplify_tiles(run: TiledRun, budget: int, views: Cameras | None = None) -> 
         return Merged(whole, _report(run, run.sizes, []))
     frame = run.sampled_frame()  # units that tiles share, so that their costs compare
     sights = None if views is None else Sights(run, views, frame)
-    merged, counts = _merged(run, budget, frame if sights is None else sights.frame, sights)
+    if isinstance(run.method, Paper):
+        counts = shares(run.sizes, budget)
+        merged = _reduced(run, counts, shares(run.sizes, final_budget or budget))
+    else:
+        merged, counts = _merged(run, budget, frame if sights is None else sights.frame, sights)
     if sights is None:
         files, mean = [{"merged": path} for path in merged], None
     else:
@@ -81,7 +93,7 @@ def simplify_tiles(run: TiledRun, budget: int, views: Cameras | None = None) -> 
         return finished(small, store.sh_degree)
 
     scene = scene_in_tiles(store, counts, tile, key_of(files), store.sh_degree)
-    return Merged(scene, _report(run, counts, merged, seen=sights is not None))
+    return Merged(scene, _report(run, counts, merged, seen=sights is not None), merged)
 
 
 def _report(
@@ -116,8 +128,8 @@ def _report(
 
 def _merged(
     run: TiledRun, budget: int, frame: tuple[float, ...], sights: Sights | None
-) -> tuple[list[Path], tuple[int, ...]]:
-    """Merge all tiles to exactly `budget` Gaussians; return the results of `merge` and their counts."""
+) -> tuple[list[Path], list[int]]:
+    """Merge all tiles to exactly `budget` Gaussians; return the results and their counts."""
     tiles = len(run.sizes)
     if budget < tiles:
         raise _unreached(tiles, budget, tiles, "one per tile")
@@ -128,6 +140,9 @@ def _merged(
     runs: list[dict[str, Any]] = [{"mean_run": mean_run}] * tiles
     costs = run.each("run_costs", "costs", frame=frame, per_tile=runs, inputs=visibility)
     runs_left, faint = _runs(run, costs, budget)
+    if run.has_own_steps:
+        counts = shares([n + f for n, f in zip(runs_left, faint, strict=True)], budget)
+        return _reduced(run, counts, counts, visibility), counts
     ends = plan_ends(runs_left, budget)
     plans = run.each(
         "pair_plan",
@@ -137,7 +152,7 @@ def _merged(
         inputs=[{"costs": path, **seen} for path, seen in zip(costs, visibility, strict=True)],
     )
     merges = cheapest([_costs_of(path) for path in plans], sum(runs_left) + sum(faint) - budget)
-    counts = tuple(n - m + f for n, m, f in zip(runs_left, merges, faint, strict=True))
+    counts = [n - m + f for n, m, f in zip(runs_left, merges, faint, strict=True)]
     if sum(counts) != budget:
         raise _unreached(sum(counts), budget, tiles, "what merging leaves of them")
     merged = run.each(
@@ -150,6 +165,31 @@ def _merged(
         inputs=[{"plan": path, **seen} for path, seen in zip(plans, visibility, strict=True)],
     )
     return merged, counts
+
+
+def _reduced(
+    run: TiledRun,
+    counts: Sequence[int],
+    final: Sequence[int],
+    inputs: list[dict[str, Any]] | None = None,
+) -> list[Path]:
+    """Reduce every tile by itself to its count; return the results of `reduce`."""
+    method = asdict(run.method)
+    given = [{"method": method, "count": n, "final": end} for n, end in zip(counts, final, strict=True)]
+    return run.each("reduce", "reduce", per_tile=given, inputs=inputs)
+
+
+def shares(sizes: Sequence[int], budget: int) -> list[int]:
+    """Return counts in proportion to tiles' rows, at least 1 each, `budget` in all.
+
+    >>> shares([100, 200, 1], 30)
+    [9, 20, 1]
+    """
+    tiles, total = len(sizes), sum(sizes)
+    if budget < tiles:
+        raise _unreached(tiles, budget, tiles, "one per tile")
+    ends = [rows * (budget - tiles) // max(1, total - tiles) for rows in accumulate(n - 1 for n in sizes)]
+    return [1 + end - begin for begin, end in pairwise([0, *ends])]
 
 
 def scene_in_tiles(

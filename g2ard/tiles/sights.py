@@ -44,7 +44,7 @@ class Sights:
         self.arguments = [
             {
                 **self._chosen(light, tile),
-                "levels": self._levels(tile),
+                "levels": levels_of(self.boxes, tile),
                 "shrunk": self.shrunk,
             }
             for tile in range(len(run.coarse))
@@ -107,14 +107,15 @@ class Sights:
             "others_weight": weight_of_others(self.usual, self.others),
         }
 
-    def _levels(self, tile: int) -> list[str | None]:
-        """Return the coarse level of every tile in views of `tile`, None for itself."""
-        low, high = self.boxes[:, 0], self.boxes[:, 1]
-        gaps = np.maximum(0.0, np.maximum(low - high[tile], low[tile] - high))
-        near = np.linalg.norm(gaps, axis=1) <= np.linalg.norm(high[tile] - low[tile])
-        levels: list[str | None] = ["near" if is_near else "far" for is_near in near]
-        levels[tile] = None
-        return levels
+
+def levels_of(boxes: NDArray[np.float64], tile: int) -> list[str | None]:
+    """Return the coarse level of every tile in views of `tile`, None for itself."""
+    low, high = boxes[:, 0], boxes[:, 1]
+    gaps = np.maximum(0.0, np.maximum(low - high[tile], low[tile] - high))
+    near = np.linalg.norm(gaps, axis=1) <= np.linalg.norm(high[tile] - low[tile])
+    levels: list[str | None] = ["near" if is_near else "far" for is_near in near]
+    levels[tile] = None
+    return levels
 
 
 def boxes_of(coarse: Sequence[Path]) -> NDArray[np.float64]:

@@ -4,8 +4,8 @@
 Between steps the tiles agree on a common frame for costs and on how many Gaussians each keeps
 (`g2ard.tiles.merging`). Common parameters:
 
-- arguments: `tile`, its number; `config`, the fields of `Default`; `frame`, the values of the common
-  `_core.TileFrame`; `levels`, per tile the coarse scene ("near", "far") that represents it around this tile,
+- arguments: `tile`, its number; `config`, the fields of `Default` or `Fast`; `frame`, the values of the
+  common `_core.TileFrame`; `levels`, per tile the coarse scene ("near", "far") that represents it around it,
   None for this tile.
 - inputs: `own`, the output of `coarse` for this tile (not for `coarse` itself); `coarse`, the same for every
   tile; `views`, cameras in world coordinates; `visibility`, the output of `visibility` for this tile, absent
@@ -31,7 +31,7 @@ from g2ard.scene.cameras import Cameras
 from g2ard.scene.prepared import PreparedScene, as_prepared, finite_rows_of
 from g2ard.scene.splats import Splats
 from g2ard.scene.transform import join
-from g2ard.stages.simplify import Default, SimplifyConfig, simplify
+from g2ard.stages.simplify import Pairs, SimplifyConfig, simplify
 from g2ard.stages.simplify.pairs import emphasised, splats_of
 from g2ard.tiles.executor import Workers
 from g2ard.tiles.tasks import (
@@ -78,7 +78,7 @@ def coarse(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
     """
     scene = tile_of(arguments, inputs, places)
     # Regions to keep do not matter for other tiles' views.
-    config = replace(_config(arguments), keep_region=(), keep_times=Default.keep_times)
+    config = replace(_config(arguments), keep_region=(), keep_times=Pairs.keep_times)
     some = _widened(scene.take(scene.core.order[::_COARSE_STRIDE]), _COARSE_STRIDE)
     near = simplify(some, max(1, len(scene) // COARSE[0]), method="fast", config=config).splats
     far = simplify(near, max(1, len(scene) // COARSE[1]), method="fast", config=config).splats
@@ -232,9 +232,10 @@ def merge(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
         inputs: `plan`, the output of `pair_plan`; `visibility`.
 
     Returns:
-        `scene`, n = runs − merges + faint Gaussians (`scene_of`), opacities unfitted; `members`, (n,) rows
-        merged into each; `clamped`, the number of clamped opacities; with views also `wanted`, (n,) Σ αT² of
-        the members, and `unseen`, the number of rows that no view sees.
+        `scene`, n = runs − merges + faint Gaussians (`scene_of`), opacities unfitted; `parents`, (N,) int32,
+        the Gaussian of each row, −1 for dropped ones; `members`, (n,) rows merged into each; `clamped`, the
+        number of clamped opacities; with views also `wanted`, (n,) Σ αT² of the members, and `unseen`, the
+        number of rows that no view sees.
     """
     scene = tile_of(arguments, inputs, places)
     runs, merges = arguments["runs"], arguments["merges"]
@@ -251,13 +252,42 @@ def merge(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
     if faint := np.flatnonzero(dropped)[: arguments["faint"]].tolist():
         of[faint], dropped[faint] = np.arange(len(small), len(small) + len(faint)), False
         small = join([small, scene.take(scene.core.order[faint])])
-    kept, made = ~dropped, arrays_of(small, "scene")
+    parents = np.empty(len(scene), np.int32)
+    parents[scene.core.order] = of.view(np.int32)  # GONE is −1
+    return _merged(scene, small, parents, out["clamped_opacities"], inputs)
+
+
+def reduce(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
+    """Simplify a tile as a scene of its own, by a method that has steps which tiles do not share.
+
+    Args:
+        arguments: `tile`; `method`, the fields of its config; `count`, the Gaussians to keep; `final`, those
+            that further rounds keep.
+        inputs: `visibility`.
+
+    Returns:
+        What `merge` returns; also `protected`, (n,) bool.
+    """
+    scene, config = tile_of(arguments, inputs, places), SimplifyConfig(**arguments["method"])
+    seen, final = _visibility(inputs), arguments["final"]
+    done = simplify(scene, arguments["count"], config=config, visibility=seen, final_budget=final)
+    clamped = done.report.clamped_opacities
+    made = _merged(scene, done.splats, done.parents.astype(np.int32), clamped, inputs)
+    return made | {"protected": done.protected}
+
+
+def _merged(
+    scene: PreparedScene, small: Splats, parents: NDArray[np.int32], clamped: int, inputs: Inputs
+) -> Arrays:
+    """Return what `merge` returns; sums do not depend on the order of the tile's rows."""
+    of = parents[scene.core.order]
+    kept = of >= 0
+    made = {**arrays_of(small, "scene"), "parents": parents, "clamped": np.array(clamped)}
     made["members"] = np.bincount(of[kept], minlength=len(small))
-    if "visibility" in inputs:
-        (weight,) = load(inputs["visibility"], "weight")
-        made["wanted"] = np.bincount(of[kept], weight[scene.core.order][kept], len(small))
-        made["unseen"] = np.array(np.count_nonzero(weight[scene.core.order][kept] == 0))
-    made["clamped"] = np.array(out["clamped_opacities"])
+    if (seen := _visibility(inputs)) is not None:
+        weight = seen.weight[scene.core.order][kept]
+        made["wanted"] = np.bincount(of[kept], weight, len(small))
+        made["unseen"] = np.array(np.count_nonzero(weight == 0))
     return made
 
 
@@ -300,24 +330,28 @@ def _sum_of(
     return sums.by_row()[0][: len(own)]
 
 
-def _config(arguments: Arguments) -> Default:
-    return Default(**arguments["config"])
+def _config(arguments: Arguments) -> Pairs:
+    config = SimplifyConfig(**arguments["config"])
+    assert isinstance(config, Pairs)
+    return config
 
 
 def _merging(
-    scene: PreparedScene, config: Default, frame: _core.TileFrame, visibility: SampledVisibility | None
+    scene: PreparedScene, config: Pairs, frame: _core.TileFrame, visibility: SampledVisibility | None
 ) -> _core.TileMerging:
     seen = None if visibility is None else emphasised(scene, visibility, config)
     return _core.TileMerging(scene.core, frame, config, seen)
 
 
 def _seen_tile(scene: PreparedScene, arguments: Arguments, inputs: Inputs) -> _core.TileMerging:
-    seen = (
-        SampledVisibility(*load(inputs["visibility"], "weight", "pixel_size"))
-        if "visibility" in inputs
-        else None
-    )
-    return _merging(scene, _config(arguments), _core.TileFrame(*arguments["frame"]), seen)
+    frame = _core.TileFrame(*arguments["frame"])
+    return _merging(scene, _config(arguments), frame, _visibility(inputs))
+
+
+def _visibility(inputs: Inputs) -> SampledVisibility | None:
+    if "visibility" not in inputs:
+        return None
+    return SampledVisibility(*load(inputs["visibility"], "weight", "pixel_size"))
 
 
 def _widened(scene: Splats, times: int) -> Splats:
@@ -334,16 +368,22 @@ def sample_stride(count: int) -> int:
 
 
 class TiledRun:
-    """Steps of a tiled simplification, of which the first, `coarse`, runs at once."""
+    """Steps of a tiled simplification, of which the first, `coarse`, runs at once.
+
+    Attributes:
+        method: settings of the method.
+        merging: those of the method that tiles share costs by: `fast`, otherwise `default`.
+    """
 
     def __init__(self, store: TileStore, workers: Workers, config: SimplifyConfig):
         self.store, self.workers = store, workers
         workers.folder.mkdir(parents=True, exist_ok=True)
         model = store.render_model
-        merging = config.turned("default")
-        assert isinstance(merging, Default)
+        self.method = config
+        merging = config if isinstance(config, Pairs) else config.turned("default")
+        assert isinstance(merging, Pairs)
         self.merging = merging
-        self.config = asdict(merging.resolved(antialiased=model == "antialiased"))
+        self.config = asdict(self.merging.resolved(antialiased=model == "antialiased"))
         self.sizes = [tile.rows for tile in store.tiles]
         self.coarse: list[Path] = []
         sampled = [{"sampled": sample_stride(store.count)}] * len(self.sizes)
@@ -380,6 +420,11 @@ class TiledRun:
             )
         return self.workers.run(tasks, stage)
 
+    @property
+    def has_own_steps(self) -> bool:
+        """Whether tiles merge by themselves, because each step moves what the next one joins."""
+        return self.config["method"] == "fast" or self.config["morton_premerge_steps"] > 1
+
     def pairs_per_row(self, budget: int) -> float:
         """Return the Gaussians per row of the result from which neighbouring pairs merge."""
         ratio = self.merging.resolved(ratio=self.store.count / budget).morton_premerge_ratio
@@ -394,4 +439,4 @@ class TiledRun:
         sample = self.sample().with_sh_degree(0)
         every = -(-len(sample) // _FRAME_SAMPLE)
         scene, _ = finite_rows_of(sample.take(slice(None, None, every)))
-        return tuple(_core.TileFrame.of_sample(scene.core, Default(**self.config)).values())
+        return tuple(_core.TileFrame.of_sample(scene.core, SimplifyConfig(**self.config)).values())

@@ -131,28 +131,6 @@ INPUT = [
 ]
 """Exit status 1."""
 
-WHOLE = {
-    "simplify ball.ply -r 10 -o x.ply --tile-rows 150": (
-        ("--method fast", "--method fast"),
-        ("--preset paper", "--preset paper"),
-        ("--parents p.npy", "--parents"),
-        ("--set morton_premerge_steps=3", "--set simplify.morton_premerge_steps"),
-    ),
-    "distill ball.ply -r 10 -o x --views views.json --tile-rows 150": (
-        ("--method fast", "--method fast"),
-        ("--preset paper-lift", "--preset paper-lift"),
-        ("--schedule paper", "--schedule paper"),
-        ("--clean", "--clean"),
-        ("--set morton_premerge_steps=3", "--set simplify.morton_premerge_steps"),
-    ),
-}
-"""Command in tiles → options that need the whole scene, and how they are named."""
-INPUT += [
-    (f"{command} {given}", f"ball.ply: {named} needs the whole scene in memory")
-    for command, options in WHOLE.items()
-    for given, named in options
-]
-
 
 @pytest.mark.parametrize(
     ("command", "words", "status"), [(*case, 2) for case in USAGE] + [(*case, 1) for case in INPUT]

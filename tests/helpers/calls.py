@@ -350,10 +350,8 @@ ON: dict[str, dict[str, str]] = {
 REFUSED: dict[tuple[str, str], str] = {
     ("distill", "fit"): "8,865 bytes are too few",
     ("distill", "keep_region"): "no effect on the method paper",
-    ("distill", "tile_rows"): "--preset paper needs the whole scene in memory",
     ("simplify", "images"): "no effect on the method paper",
     ("simplify", "keep_region"): "no effect on the method paper",
-    ("simplify", "tile_rows"): "--preset paper needs the whole scene in memory",
     ("simplify", "up"): "no effect without generated views",
     ("simplify", "views"): "no effect on the method paper",
     ("adapt", "prior_views"): "no effect on the schedule paper",

@@ -12,10 +12,14 @@ import numpy as np
 import pytest
 
 import g2ard
-from g2ard.io import write_views
+from g2ard.io import Source, write_views
 from g2ard.io.colmap import texts_of
 from g2ard.io.images import write_png
 from g2ard.io.types import Points
+from g2ard.jobs.budget import Budget
+from g2ard.jobs.distill import preparing
+from g2ard.jobs.distill_options import DistillOptions
+from g2ard.jobs.tile_options import Tiling
 from helpers.photos import photographed
 from helpers.scenes import around, assert_same_bits, checkered_ball
 
@@ -226,4 +230,17 @@ def test_points_that_held_out_photos_found_change_no_bit(
             write_views(held_out, views.take([name in names for name in views.names]))
         done = g2ard.distill(points if given else None, views=folder, held_out=held_out, count=90, steps=3)
         found.append(done.splats)
+    assert_same_bits(*found)
+
+
+def test_points_in_tiles_are_those_that_training_photos_found(tmp_path: Path) -> None:
+    found = []
+    for moved in (False, True):
+        folder = tmp_path / f"{moved}"
+        points = _model(folder, ".bin", moved)
+        (points.parent / "test.txt").write_text("\n".join(f"{name}.png" for name in names_of(HELD_OUT)))
+        options = DistillOptions(views=folder, settings={"steps": 3})
+        tiling = Tiling(100, workers=1, folder=folder / "work")
+        with preparing(Source(points), Budget(count=90), options, tiling) as job:
+            found.append(job.run().splats)
     assert_same_bits(*found)

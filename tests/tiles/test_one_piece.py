@@ -16,7 +16,9 @@ from g2ard.io import read_view_set, write_points
 from g2ard.io.types import Points
 from g2ard.rendering.targets import TeacherRenders
 from g2ard.scene.splats import Splats
+from g2ard.scene.transform import join
 from g2ard.stages.simplify.gaps import opacity_lost
+from g2ard.tiles.ingest import ingest
 from helpers.commands import CommandLine, succeeds
 from helpers.photos import photographed
 from helpers.scenes import checkered_ball, under_a_sky
@@ -92,6 +94,81 @@ def test_simplified_scenes_look_alike(
         assert scores[1] > scores[0] - _LOST, scores
         lost = opacity_lost(dense, tiled, targets.cameras)
         assert other["opacity_lost"] == pytest.approx(lost, rel=0.5, abs=0.005)
+
+
+METHODS = {
+    "fast": ("--method", "fast"),
+    "fast, seen": ("--method", "fast", "--views", "views.json"),
+    "paper": ("--preset", "paper"),
+    "two steps": ("--set", "simplify.morton_premerge_steps=2"),
+}
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_every_method_works_in_tiles(
+    name: str, inputs: Path, command_line: CommandLine, tmp_path: Path
+) -> None:
+    folder = shutil.copytree(inputs, tmp_path / "there")
+    dense = g2ard.load(folder / "landscape.ply")
+    targets = TeacherRenders(dense, g2ard.make_pool(dense, 12, size=(120, 90)))
+    both(command_line, folder, "simplify", "landscape.ply", "-n", 200, *METHODS[name], output=".ply")
+    small = [g2ard.load(folder / f"{way}.ply") for way in WAYS]
+    assert [len(each) for each in small] == [200, 200]
+    scores = [g2ard.evaluate(each, targets).psnr for each in small]
+    assert scores[1] > scores[0] - _LOST_BY_FEW, scores
+
+
+def test_rounds_begin_where_memory_holds_them(
+    inputs: Path, command_line: CommandLine, tmp_path: Path
+) -> None:
+    call = ("distill", inputs / "object.ply", "-n", 300, "--preset", "paper", "--size", 64, "--no-page")
+    few = ("--set", "recover.schedule.round_steps=5", "--steps", 10)
+    one, other = both(command_line, tmp_path, *call, *few, output="")
+    counts, tiled = ([entry["count"] for entry in report["rounds"]] for report in (one, other))
+    assert tiled == [count for count in counts if count <= 700]
+    assert len(tiled) > 1
+    assert other["rounds"][1]["simplify"]["protected"] > 0  # flags of the tiles reach the next round
+    psnr = [report["scores"]["recovered"]["psnr"] for report in (one, other)]
+    assert psnr[1] > psnr[0] - _LOST_BY_FEW, psnr
+
+
+def test_clutter_is_removed_alike(inputs: Path, command_line: CommandLine, tmp_path: Path) -> None:
+    dense = g2ard.load(inputs / "landscape.ply")
+    rng = np.random.default_rng(1)
+    giant = Splats.create(np.zeros((1, 3)), scales=np.full((1, 3), 40.0), logit_opacities=[-3])
+    some = dense.take(rng.integers(0, 2000, 400))
+    dust = replace(some, scales=some.scales / 50, logit_opacities=np.full(400, -4.0, np.float32))
+    g2ard.save(tmp_path / "cluttered.ply", join([dense, giant, dust]))
+    call = ("distill", "cluttered.ply", "-n", 300, "--clean", "--steps", 10, "--size", 64, "--no-page")
+    one, other = both(command_line, tmp_path, *call, output="")
+    for kind, count in one["cleaned"].items():
+        assert other["cleaned"][kind] == pytest.approx(count, rel=0.1, abs=8), (kind, one, other)
+    assert other["cleaned"]["giant"] == 1
+    assert other["cleaned"]["invisible"] > 150
+    psnr = [report["scores"]["recovered"]["psnr"] for report in (one, other)]
+    assert psnr[1] > psnr[0] - _LOST_BY_FEW, psnr
+
+
+@pytest.mark.parametrize("tiles", [False, True])
+def test_parents_are_of_the_rows_of_the_file(
+    tiles: bool, inputs: Path, command_line: CommandLine, tmp_path: Path
+) -> None:
+    source = tmp_path / "scene.ply"
+    head, end, data = (inputs / "landscape.ply").read_bytes().partition(b"end_header\n")
+    values = np.frombuffer(data, "<f4").reshape(2000, -1).copy()
+    values[::7, 4] = np.nan  # rows that are not read
+    source.write_bytes(head + end + values.tobytes())
+    if tiles:
+        source = ingest(source, tmp_path / "tiles", tile_rows=700).folder
+    rows = g2ard.load(source)
+    call = ("simplify", source, "-n", 200, "--no-views", "--parents", "parents.npy", *WAYS["tiles"][2:])
+    most = () if tiles else WAYS["tiles"][:2]
+    succeeds(command_line, tmp_path, *call, *most, "-o", "small.ply")
+    small, parents = g2ard.load(tmp_path / "small.ply"), np.load(tmp_path / "parents.npy")
+    assert parents.shape == (len(rows),)
+    assert set(parents) - {-1} == set(range(200))
+    away = np.linalg.norm(rows.means - small.means[parents], axis=1)[parents >= 0]
+    assert np.median(away) < 0.6 < np.median(np.linalg.norm(rows.means - small.means[::-1][parents], axis=1))
 
 
 INPUTS = {

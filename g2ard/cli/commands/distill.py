@@ -98,7 +98,7 @@ def distill(
     from g2ard.jobs.cost import check_job_memory, cost_of
     from g2ard.jobs.distill import preparing
     from g2ard.jobs.distill_options import DistillOptions
-    from g2ard.jobs.tile_options import is_tiled, needs_whole, refuse_whole
+    from g2ard.jobs.tile_options import is_tiled
     from g2ard.pipeline.config import DistillConfig
 
     settings, _ = run.settled(DistillConfig(), preset)
@@ -137,9 +137,7 @@ def distill(
     )
     tiling = tiling_of(run, source, output)
     how = tiling if source is not None and is_tiled(source, tiling) else None
-    if source is not None and budget is not None and how is not None:
-        refuse_whole(source, needs_whole(options.config, preset, clean=clean))
-    elif scene is not None and budget is not None:
+    if scene is not None and budget is not None and how is None:
         say_fit(run, scene, budget, f"scene.{format}")
     written = None if dry_run else how
     held = work_folder(run, written, options.views, options.held_out, again=" with --resume")

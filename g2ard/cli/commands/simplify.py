@@ -72,7 +72,7 @@ def simplify(
     from g2ard.jobs.inputs import GivenViews
     from g2ard.jobs.memory import WHOLE_TIMES, check_whole_memory
     from g2ard.jobs.simplify import reducing
-    from g2ard.jobs.tile_options import is_tiled, needs_whole, refuse_whole
+    from g2ard.jobs.tile_options import is_tiled
     from g2ard.stages.simplify import SimplifyConfig
 
     config = run.settled(SimplifyConfig(), preset)[1]
@@ -95,14 +95,17 @@ def simplify(
     if outputs is not None:
         outputs.check()
     how, maps = tiling if is_tiled(source, tiling) else None, None
-    if how is not None:
-        refuse_whole(source, needs_whole(config, preset, parents=parents))
-    else:
+    if parents is not None and how is not None and source.kind == "points":
+        raise typer.BadParameter(
+            f"--parents: points become rows when tiles are written; run `g2ard ingest {scene} -o DIR`, "
+            "then simplify DIR"
+        )
+    if parents is not None and not dry_run:
+        maps = Outputs(parents, budgets, run.claim_file, name="--parents")
+    if how is None:
         say_fit(run, scene, budgets[0], name)
         if source.kind != "points":
             check_whole_memory(source, tiling, WHOLE_TIMES)
-        if parents is not None and not dry_run:
-            maps = Outputs(parents, budgets, run.claim_file, name="--parents")
         blind = no_views or config.method == "paper" or (config.method == "fast" and views is None)
         seen = [] if blind else [("poses", 1.0), ("visibility", 2.0)]  # seconds for playbot
         looked = [] if blind else [("visibility", 0.5)]
@@ -145,7 +148,8 @@ def simplify(
                     atomic_output(parents, overwrite=run.overwrite) as temporary,
                     temporary.open("wb") as file,
                 ):
-                    np.save(file, small.parents)  # (N,) int64 in the scene's row order
+                    rows_of = small.parents if how is None else small.parents(source.scene)
+                    np.save(file, rows_of)  # (N,) int64 in the scene's row order
             written = time.perf_counter()
             seconds = {"read": reading, "simplify": simplified - started, "write": written - simplified}
             seconds["total"], started = sum(seconds.values()), written
