@@ -8,6 +8,7 @@ import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,7 +22,7 @@ from g2ard.cli.resume import (
     left_at,
 )
 from g2ard.cli.run import Run
-from g2ard.config.choices import BLACK, Colour, ViewFormat
+from g2ard.config.choices import BLACK, WHITE, Colour, ViewFormat
 from g2ard.errors import InputError, OutputError
 from g2ard.io import Source, write_views
 from g2ard.io.atomic import atomic_output, check_output, drop_empty, drop_temporaries
@@ -205,7 +206,11 @@ class RunFolder:
         if best is None:
             return report, ""
         with self._run.showing(_PICTURE):
-            drawn = [pictures(best, row, list(renderers.values())) for row in range(len(best.cameras))]
+            on_white = None
+            if job.renders and self._backdrop(recover.background, job.prior) is None:
+                on_white = partial(job.dense.images, background=WHITE)
+            rows = range(len(best.cameras))
+            drawn = [pictures(best, row, list(renderers.values()), on_white) for row in rows]
             preview(self.path / _PICTURE, drawn, scenes)
         line = ""
         if self._run.config["page"]:
@@ -222,7 +227,7 @@ class RunFolder:
             files = {self.scene.name: self.scene.name, "view in the browser": self._view.name, "folder": "."}
             files = {text: name for text, name in files.items() if (self.path / name).exists()}
             command = shlex.join(["g2ard", *sys.argv[1:]])
-            shown: Any = {"best": drawn[0], "command": command, "files": files}
+            shown: Any = {"best": drawn[0], "on_white": on_white, "command": command, "files": files}
             distill_report(page, title, renderers, targets, report, told, **shown)
         return report, line
 
@@ -246,8 +251,7 @@ class RunFolder:
         if count > most:
             return None, f"{self._view} skipped: over {most:,} Gaussians (`g2ard view` writes it anyway)"
         stand = frame_with(splats, cameras)
-        known = None if background == BLACK else background
-        behind = backdrop(known, [splats if dense is None else dense[1]])
+        behind = self._backdrop(background, splats if dense is None else dense[1])
         shown: list[Source | str] = [names_of([self.path])[0]]
         scenes, roles = [splats], [RESULT]
         if dense is not None and count < len(dense[1]) <= LARGEST_DENSE:
@@ -256,6 +260,11 @@ class RunFolder:
         turned = [(label, stand.of(scene)) for label, scene in zip(labels, scenes, strict=True)]
         written, _ = write_page(self._view, turned, start=stand.start, background=behind, overwrite=True)
         return written, f"view: {self._view} ({written / 1e6:.2f} MB)"
+
+    @staticmethod
+    def _backdrop(background: Colour, scene: Splats) -> Colour | None:
+        """Return what is behind a scene in pictures and on pages, see `backdrop`."""
+        return backdrop(None if background == BLACK else background, [scene])
 
     def say_files(self, page: str = "") -> None:
         """Name the files, and record that the run is finished."""

@@ -10,6 +10,8 @@ Colour = tuple[float, float, float]
 BLACK: Colour = (0.0, 0.0, 0.0)
 """Default background colour."""
 
+WHITE: Colour = (1.0, 1.0, 1.0)
+
 LengthUnit = Literal["m", "ft", "us-ft"]
 """Units of scenes on a globe."""
 UNITS: dict[LengthUnit, float] = {"m": 1.0, "ft": 0.3048, "us-ft": 1200 / 3937}

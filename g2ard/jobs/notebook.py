@@ -22,6 +22,7 @@ from g2ard.jobs.viewer_frame import backdrop, frame_of
 from g2ard.poses import best_views
 from g2ard.progress import Progress, Say, kernel, silent, unsaid
 from g2ard.rendering.renderer import Renderer
+from g2ard.rendering.sky import seen_on_sky
 from g2ard.rendering.targets import Targets
 from g2ard.report.labels import RESULT, labels_of
 from g2ard.report.sheet import contact_sheet
@@ -125,7 +126,9 @@ def _picture(shown: Any) -> str:
         return _embedded(_row(shown))
     scene = scene_of(shown)
     view = best_views(scene, size=_SIZE)[0]
-    return _embedded(Renderer(scene).clipped(view))
+    drawn = Renderer(scene).render(view)
+    lifted = backdrop(None, [scene]) is None
+    return _embedded(seen_on_sky(drawn) if lifted else np.clip(drawn.image, 0, 1))
 
 
 def _row(targets: Targets) -> NDArray[np.uint8]:

@@ -1,7 +1,7 @@
 """Report page and preview picture of a distillation."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import zip_longest
 from pathlib import Path
@@ -17,12 +17,13 @@ from g2ard.progress import plural
 from g2ard.rendering.exposure import rendered
 from g2ard.rendering.metrics import psnr
 from g2ard.rendering.renderer import Renderer
+from g2ard.rendering.sky import over_sky, seen_on_sky
 from g2ard.rendering.targets import Targets, mask_of
 from g2ard.report.labels import DENSE, RESULT, TARGET, labels_of
 from g2ard.report.page import Page, Shown
 from g2ard.report.run import COLUMNS, LOST, KindScore, RunReport, cells
 from g2ard.report.sheet import contact_sheet
-from g2ard.scene.cameras import rows_by_kind
+from g2ard.scene.cameras import Cameras, rows_by_kind
 from g2ard.scene.splats import Splats
 from g2ard.stages.evaluate import ViewScore
 
@@ -42,11 +43,27 @@ class Pictures:
     psnrs: list[float]
 
 
-def pictures(targets: Targets, view: int, renderers: Sequence[Renderer]) -> Pictures:
-    """Render a view of targets."""
+Lit = Callable[[Cameras], Targets]
+"""Function that draws the dense scene on white."""
+
+
+def pictures(
+    targets: Targets, view: int, renderers: Sequence[Renderer], on_white: Lit | None = None
+) -> Pictures:
+    """Render a view of targets.
+
+    Args:
+        on_white: of a dense scene that has holes, behind which pictures show the sky; they are scored on
+            black. None leaves the background.
+    """
     mask, target = mask_of(targets, view), targets[view]
     renders = [rendered(renderer, targets, view) for renderer in renderers]
     psnrs = [psnr(image, target, mask) for image in renders]
+    if on_white is not None:
+        camera = targets.cameras[view]
+        light = (on_white(targets.cameras.take([view]))[0] - target).mean(axis=2)
+        target = over_sky(target, np.clip(light, 0, 1))
+        renders = [seen_on_sky(renderer.render(camera)) for renderer in renderers]
     shown = [to_bytes(scored(image, targets, view)) for image in renders]
     return Pictures(targets.cameras.names[view], to_bytes(scored(target, targets, view)), shown, psnrs)
 
@@ -65,6 +82,7 @@ def distill_report(
     told: Sequence[str] = (),
     *,
     best: Pictures,
+    on_white: Lit | None = None,
     command: str = "",
     files: Mapping[str, str] = MappingProxyType({}),
 ) -> None:
@@ -76,6 +94,7 @@ def distill_report(
         targets: photos or teacher renders of the held-out views, and of the views of other kinds, if any.
         told: summary lines that the command prints.
         best: a view that shows most of the scene.
+        on_white: see `pictures`.
         command: the command line of the run.
         files: text of links → files of the run, relative to the page; the first is the scene.
     """
@@ -118,7 +137,7 @@ def distill_report(
     if worst:
         page.heading("Worst views")
     for view in worst:
-        show(pictures(*views[view], list(renderers.values())))
+        show(pictures(*views[view], list(renderers.values()), on_white))
     page.paragraph(
         f"Made in {report.seconds['total']:,.0f} s. Scored against {report.against} in views that were not "
         f"trained on, which blend {report.overdraw:.1f} Gaussians per pixel."

@@ -12,6 +12,8 @@ from PIL import Image
 
 import g2ard
 from g2ard.config.choices import BLACK
+from g2ard.rendering.sky import BOTTOM, TOP
+from g2ard.viewer import page as viewer_page
 from helpers.calls import CALLS, write_inputs
 from helpers.commands import CommandLine, refused, succeeds
 from helpers.photos import photos_of
@@ -252,3 +254,43 @@ def background_of(page: Path) -> Any:
     found = re.search(r'"background": (null|\[[^]]*\])', page.read_text(encoding="utf-8"))
     assert found is not None
     return json.loads(found[1])
+
+
+def _corner(picture: Path, left: int = 12, top: int = 64) -> tuple[int, ...]:
+    with Image.open(picture) as image:
+        return image.convert("RGB").getpixel((left, top))
+
+
+@pytest.mark.parametrize(
+    ("ask", "behind"),
+    [
+        ("lifted.ply -k 1", TOP),
+        ("lifted.ply --orbit 2", TOP),
+        ("lifted.ply -k 1 --background black", BLACK),
+        ("lifted.ply --views views.json", BLACK),  # data, not a picture
+        ("ball.ply -k 1", BLACK),
+    ],
+)
+def test_pictures_of_lifts_have_the_sky_of_their_pages(
+    ask: str, behind: tuple[float, ...], lifted: Path, tmp_path: Path, command_line: CommandLine
+) -> None:
+    succeeds(command_line, lifted, "render", *ask.split(), "--size", 64, "-o", tmp_path / "drawn")
+    assert _corner(next((tmp_path / "drawn").glob("*.png")), 0, 0) == behind
+
+
+def test_the_picture_of_a_run_has_the_sky_behind_a_lift(lifted: Path, command_line: CommandLine) -> None:
+    ask = ("distill", "-n", 60, "--steps", 2, "--size", 48, "--no-page", "-w", "-o", "run")
+    corners = []
+    for scene in ("cloud.ply", "ball.ply"):
+        succeeds(command_line, lifted, *ask, scene)
+        corners.append(_corner(lifted / "run" / "preview.png"))
+    sky, black = (np.array(corner, float) for corner in corners)
+    low, high = np.minimum(TOP, BOTTOM), np.maximum(TOP, BOTTOM)
+    assert ((sky >= low - 1) & (sky <= high + 1)).all()
+    assert black.max() < 8
+
+
+def test_the_sky_of_pictures_is_that_of_pages() -> None:
+    style = (Path(viewer_page.__file__).parent / "page.css").read_text(encoding="utf-8")
+    colors = [tuple(bytes.fromhex(found)) for found in re.findall(r"gradient\(#(\w+), #(\w+)\)", style)[0]]
+    assert colors == [TOP, BOTTOM]

@@ -89,7 +89,9 @@ def render(
     from g2ard.jobs.inputs import GivenViews, load_views
     from g2ard.jobs.run_views import at_size, is_planned, looks_at, orbit, planned_at, views_or_pool
     from g2ard.jobs.view_checks import warn_of_sight
+    from g2ard.jobs.viewer_frame import backdrop
     from g2ard.rendering.renderer import RasterSettings, Renderer, stations
+    from g2ard.rendering.sky import seen_on_sky
 
     if output is None and sheet is None:
         raise typer.BadParameter("give -o DIR, --sheet FILE.png or both")
@@ -139,6 +141,8 @@ def render(
         run.claim("--output", *(file for place in places for file in _files(output / place, depth)))
     shown: list[NDArray[np.uint8]] = []
     colour = opt.background_of(run, background, scene) or BLACK
+    generated = turn is not None or looks is not None or is_planned(found)
+    sky = generated and colour == BLACK and background is None and backdrop(None, [splats]) is None
     renderer = Renderer(splats, background=colour, settings=RasterSettings(convention=convention))
 
     def draw(folder: Path | None) -> Iterator[NDArray[np.uint8]]:
@@ -147,9 +151,11 @@ def render(
             rendered: Rendered | None = None
             if around:
                 rendered = renderer.panorama(camera, width=2 * max(2, (size[0] if size else _PANORAMA) // 2))
-            elif depth:
+            elif depth or sky:
                 rendered = renderer.render(camera)
             image = renderer.image(camera) if rendered is None else rendered.image
+            if rendered is not None and sky:
+                image = seen_on_sky(rendered)
             if folder is not None:
                 _write_view(folder / places[view], image, rendered.depth if rendered and depth else None)
             pixels = to_bytes(image)
