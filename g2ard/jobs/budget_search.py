@@ -94,7 +94,11 @@ def _written(splats: Splats, name: str, **options: Any) -> Iterator[Path]:
 
 
 def count_for_bytes(
-    splats: Splats, wanted: int, name: str, reduce: Callable[[int], Splats], total: int | None = None
+    splats: Splats,
+    wanted: int,
+    name: str,
+    reduce: Callable[[int], Splats] | None,
+    total: int | None = None,
 ) -> int:
     """Return approximately the most Gaussians whose file has at most `wanted` bytes.
 
@@ -102,6 +106,7 @@ def count_for_bytes(
     bracket the result, until one fills 98 % of the bytes.
 
     Args:
+        reduce: reduces the scene to a count; None takes the first count, without trials.
         total: Gaussians of the scene, if `splats` is a sample of it. All of a .ply take as many bytes, so no
             trial is needed.
     """
@@ -111,6 +116,8 @@ def count_for_bytes(
         return _count_of_ply(splats, wanted, name, most)
     sample = splats.take(np.array(evenly_spaced(len(splats), _PROBE_ROWS, floor=True)))
     count = int(len(sample) * wanted / file_bytes(sample, name))
+    if reduce is None:
+        return min(max(count, fewest), most)
     fits, over = (0, 0), (most + 1, 0)  # (count, bytes); 0 bytes means no such file yet
     files: list[tuple[int, int]] = []
     while len(files) < _BYTES_PROBES or not fits[0]:

@@ -31,8 +31,8 @@ from g2ard.jobs.photo_colors import colored
 from g2ard.jobs.photo_points import (
     distinct,
     is_sparse_file,
-    placed_by,
     placed_source,
+    rough_points,
     sparse_file,
     sparse_points,
     topped_up,
@@ -563,11 +563,12 @@ def preparing(
 
     Args:
         tiling: how to process the scene, a file, in tiles; None reads it into memory.
-        planned: whether tiles are only planned: the job has a cost, but cannot run.
+        planned: whether this is a dry run: the job has a cost, but cannot run. Views are stand-ins, and tiles
+            are only planned.
     """
     callbacks: dict[str, Any] = {"progress": progress, "say": say}
     if tiling is None:
-        yield prepare(scene, budget, options, use=use, **callbacks)
+        yield prepare(scene, budget, options, use=use, planned=planned, **callbacks)
         return
     from g2ard.jobs.dense import opened
 
@@ -585,7 +586,7 @@ def preparing(
         source, tiling, RECOVERY_TIMES, config.simplify, config.lift, planned=planned, **callbacks
     ) as tiles:
         given = replace(tiles, views=parts)
-        yield prepare(scene, budget, options, given, use=use, began=began, **callbacks)
+        yield prepare(scene, budget, options, given, use=use, planned=planned, began=began, **callbacks)
 
 
 def prepare(
@@ -595,6 +596,7 @@ def prepare(
     tiles: Opened | None = None,
     *,
     use: Use = "distil",
+    planned: bool = False,
     began: float | None = None,
     progress: Progress = silent,
     say: Say = unsaid,
@@ -607,6 +609,7 @@ def prepare(
     Args:
         budget: None chooses a count for photos alone.
         tiles: the scene, if it is in tiles.
+        planned: see `preparing`.
         began: when the preparation began; None means now.
     """
     began, recovers = began or time.monotonic(), use != "merging"
@@ -614,14 +617,16 @@ def prepare(
     if tiles is None and not isinstance(scene, Splats):
         progress("read", 0, 0)
     if tiles is None:
-        read = _read(scene, budget, options, progress, say)
+        read = _read(scene, budget, options, progress, say, planned=planned)
     else:
         read = _in_tiles(scene, options, tiles)
     if read.cloud and not read.needs_photos:
         say(_NO_PHOTOS)
     budget = budget or Budget(count=read.usual)
     dense, cleaned = read.dense, None
-    if options.clean:
+    if options.clean and planned:
+        say("--clean: only the run finds what to remove; counts are of the whole scene")
+    elif options.clean:
         dense, cleaned = without_clutter(dense, seed=recover.seed, progress=progress, say=say)
     prior, total = dense.sample, dense.total
     default_degree = 3 if read.needs_photos else None  # points have one colour each, photos show more
@@ -636,6 +641,7 @@ def prepare(
         beside=read.beside,
         teach=not read.needs_photos and options.photos is not True,
         use=use,
+        rough=planned,
         progress=progress,
         say=say,
     )
@@ -644,7 +650,7 @@ def prepare(
         dense,
         cameras=cameras,
         blind=options.config.simplify.method == "paper",
-        given=GivenViews(seed=recover.seed),
+        given=GivenViews(seed=recover.seed, rough=planned),
         config=options.config.simplify,
         recovered=recovers,
         plan=None if tiles is None else tiles.plan,
@@ -653,9 +659,9 @@ def prepare(
     )
     wanted = reduce.resolved(budget, read.name, f"scene.{options.format}", degree)
     photos, renders = _sources(views, options.photos, read.needs_photos)
-    choice = _regularizers(options, read, prior, cameras if photos else None)
+    choice = _regularizers(options, read, prior, cameras if photos and not planned else None)
     regularizers, preset_label, measured = choice
-    if photos:
+    if photos and not planned:
         given = options.named("recover.background") is not None
         propose_background(cameras, recover.background, given, say)
         if read.given:
@@ -788,7 +794,13 @@ class _Read:
 
 
 def _read(
-    scene: Given, budget: Budget | None, options: DistillOptions, progress: Progress, say: Say
+    scene: Given,
+    budget: Budget | None,
+    options: DistillOptions,
+    progress: Progress,
+    say: Say,
+    *,
+    planned: bool = False,
 ) -> _Read:
     """Read the dense scene, or lift points; with photos they are topped up to the budget."""
     if isinstance(scene, Splats):
@@ -813,7 +825,8 @@ def _read(
     cloud, name, of_photos = _points(scene, views, say, train)
     points: Points | None = None
     if cloud is not None:
-        points = distinct(colored(cloud, train, name, progress=progress, say=say))
+        own = cloud.points if planned else colored(cloud, train, name, progress=progress, say=say)
+        points = distinct(own)
     given = 0 if points is None or scene is None else len(points)
     usual = None
     if budget is None:
@@ -829,15 +842,18 @@ def _read(
         )
     if points is None or scene is None or len(points) < wanted:
         of_photos = True
-        points = topped_up(
-            points,
-            train,
-            wanted,
-            background=recover.background,
-            seed=recover.seed,
-            progress=progress,
-            say=say,
-        )
+        if planned:
+            points = rough_points(points, train, wanted)
+        else:
+            points = topped_up(
+                points,
+                train,
+                wanted,
+                background=recover.background,
+                seed=recover.seed,
+                progress=progress,
+                say=say,
+            )
     # Each point has its disc, for as many are needed, also where positions are equal about another middle.
     config = options.config.lift
     lifted, _ = lift_rows(points.positions, points.colors, config, progress, merge=False)
@@ -868,7 +884,9 @@ def _points(
         return sparse_points(sparse, say, train), "cloud" if sparse is None else str(sparse), True
     of_photos = views is not None and is_sparse_file(scene, views)
     if sparse is not None and of_photos and train is not None:
-        cloud = placed_by(train, sparse)
+        chosen = Source(sparse)
+        chosen.through = scene.through
+        cloud = placed_source(chosen, train).cloud(bare=True).whole()
     else:
         cloud = scene.cloud(bare=views is not None).whole()
     for note in cloud.notes:

@@ -50,6 +50,7 @@ class GivenViews:
         up: (3,) direction away from the ground for generated views; None estimates it.
         seed: seed of generated views.
         shape: width and height of generated views in pixels.
+        rough: whether stand-ins of generated views do, as for a dry run: nothing is rendered for them.
     """
 
     views: Views | None = None
@@ -57,6 +58,7 @@ class GivenViews:
     up: Sequence[float] | None = None
     seed: int = 0
     shape: tuple[int, int] = (800, 600)
+    rough: bool = False
 
 
 def load_scene(

@@ -200,6 +200,17 @@ def topped_up(
     )
 
 
+def rough_points(points: Points | None, train: Cameras, count: int) -> Points:
+    """Return `count` points for a dry run: those given, and others anywhere among the cameras."""
+    own = points or Points(np.zeros((0, 3)), np.zeros((0, 3), np.float32))
+    missing = max(0, count - len(own))
+    places = train.positions if not len(own) else own.positions
+    low, high = places.min(axis=0), places.max(axis=0)
+    others = np.random.default_rng(0).uniform(low, high + np.ptp(places), (missing, 3))
+    shades = np.full((missing, 3), 0.5, np.float32)
+    return Points(np.concatenate([own.positions, others]), np.concatenate([own.colors, shades]))
+
+
 def usual_count(train: Cameras, size: int | None, sparse: int, say: Say) -> int:
     """Return the Gaussians of a scene that starts from photos alone, to two digits, and say so.
 

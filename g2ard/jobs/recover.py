@@ -273,10 +273,14 @@ def prepare(
     weighted: bool | None = None,
     render_model: RenderModel | None = None,
     anchors: Splats | str | Path | None = None,
+    rough: bool = False,
     progress: Progress = silent,
     say: Say = unsaid,
 ) -> RecoverJob:
-    """Read the inputs of `recover` without `targets`, and decide everything."""
+    """Read the inputs of `recover` without `targets`, and decide everything.
+
+    A `rough` job has a cost, but cannot run.
+    """
     check_teacher(views, teacher)
     given = full_paths(settings or {}, RecoverConfig())
     require("preset", repr(preset), preset in PRESETS, f"one of {', '.join(PRESETS)}")
@@ -290,6 +294,7 @@ def prepare(
         photos=photos,
         render_model=render_model,
         seed=config.seed,
+        rough=rough,
         progress=progress,
         say=say,
     )
@@ -305,7 +310,7 @@ def prepare(
     regularizers, why, measures = regularizers_for(
         named.get("recover.regularizers"),
         teaching.dense or built or start,
-        None if teaching.dense else chosen.cameras,
+        None if teaching.dense or rough else chosen.cameras,
         paper=named.get("recover.schedule") == "paper",
     )
     config = configured(RecoverConfig(), preset, {**given, "recover.regularizers": regularizers})

@@ -72,6 +72,11 @@ _POOL_GAUSSIANS = 4_000_000
 _POOL_SAMPLE = 200_000
 """Gaussians that poses are planned on."""
 
+_ROUGH, _ROUGH_ROWS = "estimated", 10_000
+"""Kind of the stand-ins of dry runs, and Gaussians that place them."""
+_USUAL_OTHERS = 0.4
+"""Views of other kinds that join usual ones, over their number: 0.4 to 0.6 on playbot and autzen."""
+
 _WEIGHT_VIEWS, _WEIGHT_ROWS = 80, 100_000
 """Usual views that weigh Gaussians, of which as many are used as the scene needs, and the Gaussians that they
 are planned on."""
@@ -89,6 +94,7 @@ def views_of(
     teach: bool = True,
     use: Use = "distil",
     represents: float = 1.0,
+    rough: bool = False,
     progress: Progress = silent,
     say: Say = unsaid,
 ) -> RunViews:
@@ -108,14 +114,22 @@ def views_of(
             are generated.
         use: what the message about generated views counts.
         represents: Gaussians per row if `prior` is a sample of a larger scene; the pool grows with it.
+        rough: see `GivenViews`.
     """
     wanted = ["train"] if options.held_out is not None else ["train", "test"]
-    asked = GivenViews(options.views, beside, options.up, options.config.recover.seed)
+    asked = GivenViews(options.views, beside, options.up, options.config.recover.seed, rough=rough)
     found, are_found = given_or_found(asked, prior, wanted, say)
     plan = partial(_planned, prior, asked, represents=represents, progress=progress)
     select = replace(options.config.select, focus=options.focus)
     mix = partial(
-        _mixed, prior=prior, count=count, represents=represents, size=options.size, progress=progress, say=say
+        _mixed,
+        prior=prior,
+        count=count,
+        represents=represents,
+        size=options.size,
+        rough=rough,
+        progress=progress,
+        say=say,
     )
     if found is None:
         if not teach:
@@ -301,6 +315,7 @@ def _mixed(
     learns: bool = True,
     weigh: Callable[[], NDArray[np.float64] | None] = lambda: None,
     zoom: bool = True,
+    rough: bool = False,
 ) -> _Mixed:
     """Add views of other kinds to training views: those that `complete` chooses, or of one kind with a focus.
 
@@ -312,6 +327,7 @@ def _mixed(
         weigh: returns the weights of training views; None draws them equally often, as planned ones, which
             are not crowded. The others are drawn as often as these on average.
         zoom: whether some of the training views become zooms.
+        rough: whether to add as many views as usual instead of choosing them.
     """
     usual, times = len(train.cameras), _times(prior, represents)
     spare, focus = max(_LEAST_APART, round(_VIEWS_APART * times * share)), select.focus
@@ -333,7 +349,9 @@ def _mixed(
         apart += cameras[taken:]
     others = Cameras.of(apart).fitted(size) if apart else None
     more, unseen = Cameras.of(offered) if offered and learns else None, None
-    if focus is None and more is not None:
+    if focus is None and more is not None and rough:
+        more = more.take(evenly_spaced(len(more), round(_USUAL_OTHERS * usual)))
+    elif focus is None and more is not None:
         compact, per_row = _compact(prior, count, represents, progress)
         order, _, unseen = complete(
             compact,
@@ -347,7 +365,7 @@ def _mixed(
         more = more.take(order) if len(order) else None
     if more is None:
         return train, others, unseen
-    own = weigh()
+    own = None if rough else weigh()
     weights = np.ones(usual) if own is None else own / own.mean()
     mixed = ViewSet(
         Cameras.of([*train.cameras, *more]).fitted(size),
@@ -355,7 +373,7 @@ def _mixed(
         train.splits and train.splits + ("train",) * len(more),
         np.append(weights, np.ones(len(more))),
     )
-    if focus is None and zoom:
+    if focus is None and zoom and not rough:
         mixed = replace(mixed, cameras=zoomed(compact, mixed.cameras, represents=per_row, share=share))
     return mixed, others, unseen
 
@@ -399,6 +417,7 @@ def views_or_pool(
             represents=1.0,
             select=SelectConfig(),
             size=None,
+            rough=given.rough,
             progress=progress,
             say=say,
         )
@@ -463,6 +482,8 @@ def looks_at(
 
 def _of(pool: Pool, cameras: Cameras) -> str:
     """Describe the kinds of a pool, and of further views in it, briefly."""
+    if pool.kind == _ROUGH:
+        return _ROUGH
     kinds = [pool.kind, *(kind for kind in rows_by_kind(cameras.kinds) if kind != USUAL)]
     guess = "; the up direction is a guess" if "guess" in pool.why else ""
     return f"{' + '.join(kinds)}{guess}"
@@ -514,8 +535,28 @@ def _planned(
 ) -> Pool:
     """Plan a pool as `plan_pool` does, but larger in proportion to a large scene's size."""
     times = _times(prior, represents)
+    if given.rough:
+        return _rough_pool(prior, round(count * times), given.shape)
     options |= {"size": given.shape, "up": given.up, "seed": given.seed, "represents": represents}
     return plan_pool(prior, round(count * times), rows=round(rows * times), **options)
+
+
+def _rough_pool(scene: Splats, count: int, size: tuple[int, int]) -> Pool:
+    """Return stand-ins of a pool's views on a circle around the scene."""
+    points = scene.means[evenly_spaced(len(scene), _ROUGH_ROWS)] + scene.offset
+    middle = np.median(points, axis=0)
+    away = max(3 * float(np.quantile(np.abs(points - middle), 0.9)), np.finfo(np.float32).tiny)
+
+    def cameras(name: str, count: int) -> list[Camera]:
+        turns = np.linspace(0, 2 * np.pi, count, endpoint=False)
+        eyes = middle + away * np.stack([np.cos(turns), np.sin(turns), np.zeros(count)], axis=1)
+        views = (Camera.facing(eye, middle, width=size[0], height=size[1]) for eye in eyes)
+        return [replace(view, name=f"{name}_{row:04}") for row, view in enumerate(views)]
+
+    def more(kind: str, count: int) -> list[Camera]:
+        return [replace(view, kind=kind) for view in cameras(kind, count)]
+
+    return Pool(Cameras.of(cameras("pose", count)), _ROUGH, "", np.array([0.0, 0.0, 1.0]), more=more)
 
 
 def _times(prior: Splats, represents: float) -> float:

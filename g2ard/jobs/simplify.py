@@ -155,13 +155,17 @@ class Reduction:
     def resolved(self, budget: Budget, name: str, file: str, sh_degree: int | None = None) -> ResolvedBudget:
         """Resolve a budget for the scene, called `name` in errors.
 
-        If recovery follows, bytes are searched with the method `fast` and a margin.
+        If recovery follows, bytes are searched with the method `fast` and a margin. A rough job tries
+        nothing: bytes are those of a sample, and no quality is measured.
 
         Args:
             file: a file name; its suffix is the format for `Budget.fit`.
             sh_degree: of the result; None is the scene's.
         """
         splats, say, total = self.splats, self.say, self.total
+        if self.given.rough and (budget.min_psnr is not None or budget.min_ssim is not None):
+            say("the run measures how many Gaussians keep the quality; here, a tenth")
+            return ResolvedBudget(max(1, total // 10))
         if budget.min_psnr is not None or budget.min_ssim is not None:
             return self._resolved_for_quality(Quality(budget.min_psnr or 0.0, budget.min_ssim or 0.0), file)
 
@@ -178,11 +182,12 @@ class Reduction:
                 splats = splats.with_sh_degree(sh_degree)
             exact = self.plan is not None and scene_format(file).suffix == ".ply"
             most = int(size * _BYTES_SAFETY) if self.recovered and not exact else size
-            found = count_for_bytes(splats, most, file, tried, None if self.plan is None else total)
+            try_it = None if self.given.rough else tried
+            found = count_for_bytes(splats, most, file, try_it, None if self.plan is None else total)
         else:
             found = budget.of(total, name)
             check_positions(file, splats, found)
-        if budget.layers is not None:
+        if budget.layers is not None and not self.given.rough:
             before = found
             found, layers = count_for_layers(before, budget.layers, tried)
             if found < before:

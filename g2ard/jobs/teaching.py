@@ -38,6 +38,7 @@ class Teaching:
             nothing of the scene are accepted then.
         render_model: overrides what the teacher's file says.
         seed: seed of generated views.
+        rough: whether this is for a dry run, see `GivenViews`; photos are not looked at.
     """
 
     teacher: Splats | str | Path | None
@@ -46,6 +47,7 @@ class Teaching:
     photos: bool = False
     render_model: RenderModel | None = None
     seed: int = 0
+    rough: bool = False
     progress: Progress = silent
     say: Say = unsaid
 
@@ -62,9 +64,10 @@ class Teaching:
         if self.dense is None:
             assert given is not None  # `check_teacher`
             return given
+        beside = None if isinstance(self.teacher, Splats) else self.teacher
         return views_or_pool(
             self.dense,
-            GivenViews(given, None if isinstance(self.teacher, Splats) else self.teacher, seed=self.seed),
+            GivenViews(given, beside, seed=self.seed, rough=self.rough),
             student=student,
             progress=self.progress,
             say=self.say,
@@ -84,12 +87,12 @@ class Teaching:
 
     def check_photos(self, scene: Splats, cameras: Cameras) -> None:
         """Reject photos that do not show the scene, unless they are insisted on."""
-        if self.dense is None or self.photos:
+        if (self.dense is None or self.photos) and not self.rough:
             check_photos(scene, cameras, self.background, self.say, insisted=self.photos)
 
     def targets(self, cameras: Cameras, **options: Any) -> Targets:
         """Return the targets of the views; note if another background fits their photos."""
-        if self.dense is None or self.photos:
+        if (self.dense is None or self.photos) and not self.rough:
             propose_background(cameras, self.background, self.chosen, self.say)
         return self._made(cameras, say=self.say, **options)
 

@@ -66,6 +66,7 @@ def adapt(
         photos=photos,
         render_model=run.render_model,
         seed=run.seed,
+        rough=dry_run,
         **run.callbacks,
     )
     _, targets = teaching.training(splats, opt.with_images(views, images, alpha), split, size)

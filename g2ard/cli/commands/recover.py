@@ -78,6 +78,7 @@ def recover(
         weighted=weighted,
         render_model=run.render_model,
         anchors=anchors,
+        rough=dry_run,
         **run.callbacks,
     )
     if output != opt.UNWRITTEN:

@@ -123,7 +123,10 @@ def simplify(
                 budget.of(total, str(scene))
 
     began, reports = time.perf_counter(), []
-    inputs: dict[str, Any] = {"given": GivenViews(given, None, up, run.seed), "blind": no_views}
+    inputs: dict[str, Any] = {
+        "given": GivenViews(given, None, up, run.seed, rough=dry_run),
+        "blind": no_views,
+    }
     inputs |= {"planned": dry_run, "counted": counted, **run.callbacks}
     held = work_folder(run, None if dry_run else how, given)
     with held, reducing(source, how, config=config, **inputs) as reduce:
