@@ -661,9 +661,10 @@ def prepare(
     photos, renders = _sources(views, options.photos, read.needs_photos)
     choice = _regularizers(options, read, prior, cameras if photos and not planned else None)
     regularizers, preset_label, measured = choice
-    if photos and not planned:
-        given = options.named("recover.background") is not None
-        propose_background(cameras, recover.background, given, say)
+    if photos:
+        if not planned:
+            given = options.named("recover.background") is not None
+            propose_background(cameras, recover.background, given, say)
         if read.given:
             shown = prior
             if read.needs_photos and tiles is None:

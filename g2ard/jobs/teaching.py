@@ -38,7 +38,7 @@ class Teaching:
             nothing of the scene are accepted then.
         render_model: overrides what the teacher's file says.
         seed: seed of generated views.
-        rough: whether this is for a dry run, see `GivenViews`; photos are not looked at.
+        rough: whether this is for a dry run, see `GivenViews`.
     """
 
     teacher: Splats | str | Path | None
@@ -87,7 +87,7 @@ class Teaching:
 
     def check_photos(self, scene: Splats, cameras: Cameras) -> None:
         """Reject photos that do not show the scene, unless they are insisted on."""
-        if (self.dense is None or self.photos) and not self.rough:
+        if self.dense is None or self.photos:
             check_photos(scene, cameras, self.background, self.say, insisted=self.photos)
 
     def targets(self, cameras: Cameras, **options: Any) -> Targets:

@@ -11,9 +11,12 @@ from g2ard import _core
 from helpers.calls import CALLS, ON, options_of
 from helpers.commands import CommandLine, succeeds
 
-KERNELS = ("Rasterizer", "Trainer", "VisibilityAccumulator", "TileMerging", "accumulate", "accumulate_each")
+KERNELS = ("Trainer", "VisibilityAccumulator", "TileMerging", "accumulate", "accumulate_each")
 KERNELS += ("cast_rays", "simplify_flags", "simplify_paper", "simplify_pairwise")
-"""What renders, measures coverage, plans poses, merges or trains."""
+"""What measures coverage, plans poses, merges or trains."""
+
+FEW = 15
+"""Images of 160 pixels that tell whether photos show the scene."""
 
 PLANNED = {
     name: words
@@ -32,7 +35,7 @@ CASES = {
     "nothing to do": "distill ball.ply --fit web -o out",
     "removing clutter": "distill stray.ply -r 2 --clean -o out",
     "a cloud": "distill scan.las -r 4 -o out",
-    "points with photos": "distill scan.las -r 4 --views photos.json -o out",
+    "points with photos": "distill cloud.ply -r 4 --views photos.json -o out",
     "photos alone": "distill --views photos.json -o out",
     "photos of a scene": "distill ball.ply -r 4 --views photos.json --photos -o out",
     "weighing in generated views": "simplify ball.ply -r 8 -o out.ply",
@@ -59,9 +62,22 @@ def test_a_dry_run_runs_no_kernel(
             pytest.fail(f"a dry run calls {name}")
 
         monkeypatch.setattr(_core, name, kernel)
+    drawn = []
+
+    class Counted:
+        def __init__(self, *given: Any) -> None:
+            self._own = rasterizer(*given)
+
+        def __getattr__(self, name: str) -> Any:
+            drawn.append(name)
+            return getattr(self._own, name)
+
+    rasterizer = _core.Rasterizer
+    monkeypatch.setattr(_core, "Rasterizer", Counted)
     told = succeeds(command_line, folder, *shlex.split(words), "--dry-run", "--json", "-")
     assert "nothing is written" in told.err
     assert sorted(folder.rglob("*")) == before
+    assert len(drawn) <= FEW * ("photos" in words)
 
 
 def test_a_dry_run_is_close_to_its_run(inputs: Path, tmp_path: Path, command_line: CommandLine) -> None:
