@@ -48,6 +48,10 @@ def city(
     views: Annotated[int, typer.Option(help="Photos in all four splits.")] = 120,
     size: Annotated[str, typer.Option(metavar="WxH", help="Size of photos.")] = "800x600",
     blocks: Annotated[int, typer.Option(help="City blocks per side.")] = 3,
+    tile: Annotated[
+        float | None,
+        typer.Option(min=1, metavar="METRES", help="Write the cloud as .laz tiles of this side, in cloud/."),
+    ] = None,
     offset: Annotated[str, typer.Option(metavar="X,Y,Z", help="World coordinates of the centre.")] = "0,0,0",
 ) -> None:
     """Generate a city: coloured LiDAR point cloud, photos with exact poses, splits train/val/adapt/ood."""
@@ -67,7 +71,8 @@ def city(
         )
     except InputError as error:
         raise typer.BadParameter(str(error)) from None
-    manifest = write_city(output, config, overwrite=run.overwrite, threads=run.threads, progress=run.progress)
+    how: dict[str, Any] = {"overwrite": run.overwrite, "threads": run.threads, "progress": run.progress}
+    manifest = write_city(output, config, tile=tile, **how)
     splits = ", ".join(f"{count} {name}" for name, count in manifest["views"].items())
     run.say(f"{output}: {plural(config.points, 'point')}, {splits} views of {width}×{height}")
     run.result({**manifest, "output": str(output), "seconds": time.monotonic() - began})

@@ -6,11 +6,13 @@ import json
 import os
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor, as_completed
+from contextlib import ExitStack
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from PIL import Image
 
 from benchmarks.synth.city import City, CityConfig, city
@@ -29,6 +31,7 @@ def write_city(
     config: CityConfig | None = None,
     *,
     overwrite: bool = False,
+    tile: float | None = None,
     threads: int = 0,
     progress: Progress = silent,
 ) -> dict[str, Any]:
@@ -38,6 +41,7 @@ def write_city(
         folder: output; holds cloud.ply, images/, train.json, val.json, adapt.json, ood.json, manifest.json.
         config: its configuration; None is the default city.
         overwrite: whether to replace an existing folder.
+        tile: write the cloud as .laz files of squares of this side, metres, in cloud/.
         threads: photos to take in parallel; 0 means every core. The result does not depend on it.
         progress: callback per block of points and per photo.
 
@@ -51,7 +55,11 @@ def write_city(
     check_output(folder, overwrite, folder=True)
     town = city(config)
     with atomic_folder(folder, overwrite) as place:
-        _scan(town, place / "cloud.ply", progress)
+        parts = _scanned(town, progress)
+        if tile is None:
+            write_blocks(place / "cloud.ply", town.config.points, parts)
+        else:
+            _write_tiles(place / "cloud", parts, np.asarray(town.config.offset), tile)
         for name, cameras in town.views.items():
             paths = tuple(place / "images" / f"{view}.png" for view in cameras.names)
             write_views(place / f"{name}.json", replace(cameras, image_paths=paths))
@@ -63,18 +71,36 @@ def write_city(
     return manifest
 
 
-def _scan(town: City, path: Path, progress: Progress) -> None:
-    count = town.config.points
+def _scanned(town: City, progress: Progress) -> Iterator[Points]:
+    count, done = town.config.points, 0
+    progress("cloud", 0, count)
+    for part in town.scans():
+        yield Points(part.positions, part.colors)
+        done += len(part.positions)
+        progress("cloud", done, count)
 
-    def blocks() -> Iterator[Points]:
-        done = 0
-        progress("cloud", 0, count)
-        for part in town.scans():
-            yield Points(part.positions, part.colors)
-            done += len(part.positions)
-            progress("cloud", done, count)
 
-    write_blocks(path, count, blocks())
+def _write_tiles(folder: Path, parts: Iterator[Points], offset: NDArray[np.float64], side: float) -> None:
+    """Write points as .laz files, one per square, named by its column and row from the centre."""
+    import laspy
+
+    folder.mkdir()
+    header = laspy.LasHeader(point_format=2, version="1.2")
+    header.offsets, header.scales = offset, [1e-3] * 3
+    with ExitStack() as opened:
+        files: dict[tuple[int, int], Any] = {}
+        for part in parts:
+            cells = np.floor((part.positions[:, :2] - offset[:2]) / side).astype(int)
+            for column, row in np.unique(cells, axis=0).tolist():
+                here = (cells == (column, row)).all(axis=1)
+                if (column, row) not in files:
+                    writer = laspy.open(folder / f"{column}_{row}.laz", mode="w", header=header)
+                    files[column, row] = opened.enter_context(writer)
+                points = laspy.ScaleAwarePointRecord.zeros(int(here.sum()), header=header)
+                points.x, points.y, points.z = part.positions[here].T
+                colors = np.rint(part.colors[here] * 65535).astype(np.uint16)
+                points.red, points.green, points.blue = colors.T
+                files[column, row].write_points(points)
 
 
 def _photograph(town: City, place: Path, threads: int, progress: Progress) -> None:

@@ -42,7 +42,8 @@ def tiling_of(run: Run, source: Source | None, output: Path) -> Tiling:
         raise typer.BadParameter(f"--scheduler: expected tcp://HOST:PORT or local, got {scheduler!r}")
     folder = work or _beside(output)
     run.claim("--work", folder, folder=True)
-    return Tiling(rows, size, workers, run.threads or None, scheduler, folder, keep=work is not None)
+    cores, renew = run.threads or None, work is None or run.overwrite
+    return Tiling(rows, size, workers, cores, scheduler, folder, keep=work is not None, overwrite=renew)
 
 
 def _beside(output: Path) -> Path:

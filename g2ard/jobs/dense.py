@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -90,29 +90,28 @@ def opened(
         planned: only plan this; nothing is written.
     """
     from g2ard.tiles.dense import InTiles
-    from g2ard.tiles.executor import Workers, executor
+    from g2ard.tiles.executor import Executor, Workers, executor
     from g2ard.tiles.ingest import ingest
 
     store = source.store if source.kind == "splats" else None
     _check_model(source, store)
-    if store is None and not planned:
-        store = ingest(
-            source,
-            tiling.folder / "tiles",
-            tile_rows=tiling.most_rows,
-            lift=lifting,
-            overwrite=not tiling.keep,
-            progress=progress,
-            say=say,
-        )
     stream = source.scene if source.kind == "splats" else source.cloud()
+
+    def running(plan: TilePlan) -> AbstractContextManager[Executor]:
+        return executor(plan.workers, max(1, tiling.usable_cores // plan.workers), tiling.scheduler)
+
+    if store is None and not planned:
+        how: dict[str, Any] = {"lift": lifting, "overwrite": tiling.overwrite, "say": say}
+        with running(plan_tiles(stream, tiling, times)) as runs:
+            folder = tiling.folder / "tiles"
+            rows = tiling.most_rows
+            store = ingest(source, folder, tile_rows=rows, runs=runs, progress=progress, **how)
     plan = plan_tiles(store or stream, tiling, times)
     say(f"{plan.tiles:,} tiles of {plan.count:,} Gaussians, {plan.workers} at a time")
     if planned or store is None:
         yield Opened(Planned(_sampled(stream, lifting), count=plan.count, tile_rows=tiling.most_rows), plan)
         return
-    threads = max(1, tiling.usable_cores // plan.workers)
-    with executor(plan.workers, threads, tiling.scheduler) as runs:
+    with running(plan) as runs:
         workers = Workers(runs, tiling.folder / "steps", progress)
         yield Opened(InTiles(store, workers, config, tiling.most_rows, tiling.folder), plan, store.notes)
 

@@ -28,7 +28,7 @@ _LIFTING_TIMES = 1.7
 """Memory of lifting a tile's points relative to merging it: 550 bytes per point."""
 
 _DISK_COPIES = 2
-"""Copies of a scene on the disk: its tiles with their halos, and the files of tasks."""
+"""Copies of a scene on the disk: its tiles with their halos, and the files of tasks. Points have one more."""
 
 _LEAST_ROWS = 1000
 """Rows of the smallest tiles that messages advise."""
@@ -204,5 +204,5 @@ def plan_tiles(scene: TileStore | SceneStream | PointStream, tiling: Tiling, tim
         workers * need + (_TASK_BYTES if workers > 1 else 0),
         memory,
         isinstance(scene, TileStore),
-        _DISK_COPIES * count * row_bytes,
+        (_DISK_COPIES + isinstance(scene, PointStream)) * count * row_bytes,
     )

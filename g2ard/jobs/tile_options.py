@@ -26,6 +26,7 @@ class Tiling:
         scheduler: address of a Dask cluster, see `g2ard.tiles.executor.executor`.
         folder: for tiles and the files of tasks.
         keep: whether the folder stays after success.
+        overwrite: replace tiles in it that are damaged, or others that the user keeps there.
     """
 
     tile_rows: int | None = None
@@ -35,6 +36,7 @@ class Tiling:
     scheduler: str | None = None
     folder: Path = Path(".tiles")
     keep: bool = True
+    overwrite: bool = False
 
     @property
     def most_rows(self) -> int:

@@ -14,6 +14,7 @@ from g2ard.tiles.tasks import (
     Places,
     cameras_of,
     cropped,
+    telling,
     tile_of,
     with_surroundings,
 )
@@ -38,7 +39,7 @@ def clutter(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
     cameras = cropped(cameras_of(inputs["views"]).recentred(own.offset), own, settings)
     pixels = cameras.widths.astype(int) * cameras.heights
     cameras = cameras.take(np.flatnonzero(pixels > 1)).recentred(-own.offset)
-    seen, count = visibility(amid, cameras), len(own)
+    seen, count = visibility(amid, cameras, telling), len(own)
     light = seen.weight[:count]
     share = light.sum() / max(seen.weight.sum(), 1e-30)
     unoccluded, _ = compare_depths(amid, cameras, floating=False)

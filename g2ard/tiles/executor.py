@@ -112,7 +112,7 @@ def executor(
     forget_workers()
     threads = threads or max(1, (os.cpu_count() or 1) // workers)
     if workers == 1 and not scheduler:
-        yield _run_here
+        yield run_here
         return
     with ExitStack() as opened:
         pool: Any = partial(ProcessPoolExecutor, workers, get_context("spawn"), _begin)
@@ -123,7 +123,8 @@ def executor(
         yield opened.enter_context(closing(_Pool(pool, threads, cluster))).run
 
 
-def _run_here(tasks: Sequence[Task], told: Told) -> None:
+def run_here(tasks: Sequence[Task], told: Told) -> None:
+    """Run tasks in this process."""
     for task in tasks:
         run_task(task, partial(told, task))
         told(task, 1.0)

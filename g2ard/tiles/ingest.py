@@ -22,6 +22,7 @@ from g2ard.io.types import Note
 from g2ard.progress import Progress, Say, plural, silent, unsaid
 from g2ard.stages.lift import LiftConfig, guessed_axes
 from g2ard.system.keys import key_of
+from g2ard.tiles.executor import Executor, run_here
 from g2ard.tiles.writer import clear, is_tile_file, lift_tiles, pour, row_bytes
 
 TILE_ROWS = 5_000_000
@@ -45,6 +46,7 @@ def ingest(
     like: TileStore | None = None,
     render_model: RenderModel | None = None,
     overwrite: bool = False,
+    runs: Executor = run_here,
     progress: Progress = silent,
     say: Say = unsaid,
 ) -> TileStore:
@@ -58,7 +60,8 @@ def ingest(
     Points of a point cloud are assigned in the same way and lifted tile by tile, together with the halo, so
     that points at a border have all their neighbours.
 
-    If the tiles are complete, the call returns at once; an interrupted one leaves none.
+    If the tiles are complete, the call returns at once. An interrupted one leaves none, but points that are
+    cut into tiles, and tiles of them that are lifted, serve the next call.
 
     Args:
         source: one or more scenes as accepted by `g2ard.io.read_splats`, one or more coloured point clouds as
@@ -69,7 +72,8 @@ def ingest(
         lift: constants for lifting points; None means `LiftConfig()`.
         like: reuse the tree and margin of these tiles, ignoring `tile_rows`.
         render_model: overrides what the files of scenes say.
-        overwrite: replace tiles of another scene or of other settings.
+        overwrite: replace tiles of another scene or of other settings, and damaged ones.
+        runs: executor that lifts the tiles of points; by default this process.
         progress: called with the number of rows done.
         say: called with messages.
 
@@ -120,21 +124,23 @@ def ingest(
     try:
         with locked(folder):
             _check_tiles(folder, key, settings, overwrite, say)
-            clear(folder)
+            clear(folder, key)
             try:
                 rows = block_rows or max(1, _BLOCK_BYTES // row_bytes(stream))
                 if isinstance(stream, SceneStream):
                     writer = pour(folder, stream, tile_rows, rows, progress, say, like)
+                    notes = [*stream.all_notes()]
                 else:
-                    writer = lift_tiles(folder, stream, lift, tile_rows, rows, progress, say)
-                notes = [*stream.all_notes()]
+                    how = tile_rows, rows, progress, say, runs
+                    writer, found = lift_tiles(folder, stream, lift, key, *how)
+                    notes = [*found]
                 if not like and (over := sum(count > tile_rows for count in writer.counts)):
                     tiles = plural(over, "tile")
                     text = f"{tiles} of more than {tile_rows:,} Gaussians: many share one position"
                     notes.append(Note("overfull_tiles", over, text))
                 writer.finish(key, _manifest(stream, sources, settings, notes, progress))
-            except BaseException:
-                clear(folder)
+            except BaseException as error:
+                clear(folder, key if isinstance(error, KeyboardInterrupt) else None)
                 raise
     finally:
         drop_empty(made)

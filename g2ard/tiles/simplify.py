@@ -45,6 +45,8 @@ from g2ard.tiles.tasks import (
     cropped,
     load,
     scene_of,
+    tell_share,
+    telling,
     tile_of,
     with_surroundings,
 )
@@ -80,7 +82,9 @@ def coarse(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
     # Regions to keep do not matter for other tiles' views.
     config = replace(_config(arguments), keep_region=(), keep_times=Pairs.keep_times)
     some = _widened(scene.take(scene.core.order[::_COARSE_STRIDE]), _COARSE_STRIDE)
-    near = simplify(some, max(1, len(scene) // COARSE[0]), method="fast", config=config).splats
+    near = simplify(
+        some, max(1, len(scene) // COARSE[0]), method="fast", config=config, progress=telling
+    ).splats
     far = simplify(near, max(1, len(scene) // COARSE[1]), method="fast", config=config).splats
     rows = scene.core.order[:: arguments["sampled"]]
     return {
@@ -175,6 +179,7 @@ def _add_until_converged(
         views = range(first, len(cameras), stride)
         sums.add([view_of(cameras, i, settings) for i in views], settings, None)
         used += views
+        tell_share(len(used) / len(cameras))
         before, seen = seen, int(np.count_nonzero(sums.by_row()[0][:rows]))
         if len(used) > ROUND and seen - before < CONVERGED * rows:
             break
@@ -270,7 +275,9 @@ def reduce(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
     """
     scene, config = tile_of(arguments, inputs, places), SimplifyConfig(**arguments["method"])
     seen, final = _visibility(inputs), arguments["final"]
-    done = simplify(scene, arguments["count"], config=config, visibility=seen, final_budget=final)
+    done = simplify(
+        scene, arguments["count"], config=config, visibility=seen, final_budget=final, progress=telling
+    )
     clamped = done.report.clamped_opacities
     made = _merged(scene, done.splats, done.parents.astype(np.int32), clamped, inputs)
     return made | {"protected": done.protected}

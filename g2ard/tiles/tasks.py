@@ -116,6 +116,12 @@ def tell_share(share: float) -> None:
     _TELL.get()(share)
 
 
+def telling(stage: str, done: int, total: int, info: object = None) -> None:
+    """Tell the progress of a function as the share of the running task."""
+    if total:
+        tell_share(done / total)
+
+
 def run_task(task: Task, tell: Callable[[float], None] | None = None) -> Path:
     """Run a task unless it is done; the file is written atomically.
 

@@ -5,23 +5,27 @@ import re
 import shutil
 import zlib
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from contextlib import suppress
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from g2ard.errors import OutputError
+from g2ard.errors import InputError, OutputError
 from g2ard.io.atomic import atomic_output, drop_temporaries
 from g2ard.io.detect import MANIFEST, POINTS
+from g2ard.io.jsonfile import read_json
 from g2ard.io.sanitize import Tally
 from g2ard.io.stream import PointStream, SceneStream
 from g2ard.io.tile_store import FORMAT, VERSION, TileStore, halo_name, packed, row_width, tile_name
+from g2ard.io.types import Note, Notes
 from g2ard.progress import Progress, Say, plural
 from g2ard.scene.kdtree import KdTree, Points, Sampler, cut_tree, margin_of, parts_of
-from g2ard.scene.splats import Splats
 from g2ard.stages.lift import LiftConfig, lift_rows
+from g2ard.tiles.executor import Executor, Workers
+from g2ard.tiles.tasks import Arguments, Arrays, Inputs, Places, Task, load, telling
 
 _TREE_SAMPLE = 1 << 20
 """Size of the sample of positions that determines the tiles (12 MB)."""
@@ -45,12 +49,13 @@ def expected_tiles(count: int, tile_rows: int) -> int:
     return parts_of(points, count / points, tile_rows)
 
 
-def clear(folder: Path) -> None:
-    """Remove all files that belong to tiles, the manifest first."""
+def clear(folder: Path, key: str | None = None) -> None:
+    """Remove all files that belong to tiles, the manifest first, but keep the points of those with a key."""
     drop_temporaries(folder, MANIFEST)
     for path in sorted(folder.iterdir(), key=lambda path: path.name != MANIFEST):
         if path.is_dir() and path.name == POINTS:
-            shutil.rmtree(path)
+            if key is None or not is_poured(path, key):
+                shutil.rmtree(path)
         elif is_tile_file(path.name):
             path.unlink()
 
@@ -149,8 +154,12 @@ class TileWriter:
             "cells": self.tree.to_json(),
             "tiles": tiles,
         }
-        with atomic_output(self.folder / MANIFEST, overwrite=True) as temporary:
-            temporary.write_text(json.dumps(content) + "\n", encoding="utf-8", newline="\n")
+        _write_json(self.folder / MANIFEST, content)
+
+
+def _write_json(path: Path, content: dict[str, Any]) -> None:
+    with atomic_output(path, overwrite=True) as temporary:
+        temporary.write_text(json.dumps(content) + "\n", encoding="utf-8", newline="\n")
 
 
 def pour(
@@ -200,8 +209,8 @@ def _planned(
         tree = cut_tree(points, each, tile_rows)
     margin = like.margin if like else margin_of(tree, points)
     around = each * sum(len(halo) for _, halo in tree.route(points, margin))
-    lifted = 0 if isinstance(stream, SceneStream) else 4 * row_width(0)
-    room = row_bytes(stream) + lifted  # of a row on the disk, including all copies
+    discs = 0 if isinstance(stream, SceneStream) else 2 * 4 * row_width(0)
+    room = row_bytes(stream) + discs  # of a row on the disk, including all copies
     needed, free = int((stream.count + around) * room), shutil.disk_usage(folder).free
     if needed > free:
         raise OutputError(
@@ -234,41 +243,80 @@ def lift_tiles(
     folder: Path,
     cloud: PointStream,
     config: LiftConfig,
+    key: str,
     tile_rows: int,
     rows: int,
     progress: Progress,
     say: Say,
-) -> TileWriter:
+    runs: Executor,
+) -> tuple[TileWriter, Notes]:
     """Write points to tiles in a subfolder, then lift each tile with its halo and write the result.
 
-    Arguments are those of `pour`.
+    Points that are all in tiles, and tiles that are lifted, stay for the next call if this one ends before.
+
+    Args:
+        key: of the tiles.
+        runs: lifts the tiles.
+
+    Others are those of `pour`.
+
+    Returns:
+        The tiles, and notes on the cloud.
     """
     within = folder / POINTS
     within.mkdir(exist_ok=True)
-    points = pour(within, cloud, tile_rows, rows, progress, say)
-    writer = TileWriter(folder, points.tree, points.margin, 4 * row_width(0))
-    whole, done = sum(points.counts), 0
-    progress("lift", done, whole)
-    for index, count in enumerate(points.counts):
-        splats = _lifted(points, index, cloud, config)
-        for start in range(0, len(splats), _ROWS_AT_ONCE):
-            part = splats.take(slice(start, start + _ROWS_AT_ONCE))
-            writer.add(packed(part), part.means)
-        done += count
-        progress("lift", done, whole)
+    if not is_poured(within, key):
+        points = pour(within, cloud, tile_rows, rows, progress, say)
+        notes = [asdict(note) for note in cloud.all_notes()]
+        tree = {"cells": points.tree.to_json(), "margin": points.margin, "counts": points.counts}
+        _write_json(within / MANIFEST, {"key": key, "notes": notes, **tree})
+    poured = read_json(within / MANIFEST)
+    given = {"key": key, "config": asdict(config), "offset": cloud.offset.tolist()}
+    tasks = [
+        Task(
+            f"{__name__}:lifted",
+            f"lifted-{tile:05}",
+            within,
+            {**given, "tile": tile},
+            places={"points": within},
+            cost=count,
+        )
+        for tile, count in enumerate(poured["counts"])
+    ]
+    files = Workers(runs, within, progress).run(tasks, "lift")
+    writer = TileWriter(folder, KdTree.from_json(poured["cells"]), poured["margin"], 4 * row_width(0))
+    for path in files:
+        (discs,) = load(path, "rows")
+        for start in range(0, len(discs), _ROWS_AT_ONCE):
+            part = discs[start : start + _ROWS_AT_ONCE]
+            writer.add(part, np.ascontiguousarray(part[:, :3]))
     shutil.rmtree(within)
-    return writer
+    return writer, tuple(Note(**note) for note in poured["notes"])
 
 
-def _lifted(points: TileWriter, index: int, cloud: PointStream, config: LiftConfig) -> Splats:
-    """Lift a tile's points with those of its halo as neighbours."""
-    core, halo = (
-        np.fromfile(points.folder / name, _POINT_DTYPE) for name in (tile_name(index), halo_name(index))
-    )
+def is_poured(points: Path, key: str) -> bool:
+    """Return whether a folder has all points of the tiles with this key."""
+    with suppress(InputError, LookupError, TypeError):
+        return bool(read_json(points / MANIFEST)["key"] == key)
+    return False
+
+
+def lifted(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
+    """Lift a tile's points with those of its halo as neighbours.
+
+    Args:
+        arguments: `tile`; `config`, the fields of `LiftConfig`; `offset`, that of the tiles.
+        places: `points`, the folder of their tiles.
+
+    Returns:
+        `rows`, as tiles have them.
+    """
+    names = tile_name(arguments["tile"]), halo_name(arguments["tile"])
+    core, halo = (np.fromfile(places["points"] / name, _POINT_DTYPE) for name in names)
     if not len(core):
-        return Splats.create(np.empty((0, 3)), scales=np.empty((0, 3)))
+        return {"rows": np.empty((0, row_width(0)), "<f4")}
     both = np.concatenate([core, halo])
-    discs, rows = lift_rows(both["far"], both["rgb"], config)
+    discs, rows = lift_rows(both["far"], both["rgb"], LiftConfig(**arguments["config"]), telling)
     rows = rows[rows < len(core)]
     means = np.ascontiguousarray(core["near"][rows])
-    return replace(discs.take(slice(0, len(rows))), means=means, offset=cloud.offset)
+    return {"rows": packed(replace(discs.take(slice(0, len(rows))), means=means))}

@@ -102,6 +102,18 @@ def test_damaged_tiles_are_written_again_on_request(
     assert files_of(tmp_path / "tiles") == before
 
 
+def test_damaged_tiles_of_a_work_folder_are_written_again_on_request(
+    command_line: CommandLine, place: Path, tmp_path: Path
+) -> None:
+    words = ("simplify", place / "town.ply", *BLIND, "--work", "work", "-n")
+    succeeds(command_line, tmp_path, *words, 300, "-o", "a.ply")
+    flipped(tmp_path / "work" / "tiles" / "tile-00001.f32")
+    status, _, said = command_line(*words, 299, "-o", "b.ply", cwd=tmp_path)
+    assert (status, "tile-00001.f32: its contents changed" in said) == (1, True), said
+    succeeds(command_line, tmp_path, *words, 300, "-o", "b.ply", "-w")
+    assert (tmp_path / "b.ply").read_bytes() == (tmp_path / "a.ply").read_bytes()
+
+
 def test_a_dry_run_of_ingest(place: Path, tmp_path: Path, command_line: CommandLine) -> None:
     words = ("ingest", place / "town.ply", "--tile-rows", 700, "--dry-run", "--json", "-")
     told = json.loads(succeeds(command_line, tmp_path, *words).out)

@@ -1,6 +1,7 @@
 """Clouds in blocks, and lifted tile by tile: what `lift` gives of the whole cloud."""
 
 import json
+from contextlib import nullcontext
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -11,11 +12,14 @@ from g2ard.errors import InputError, OutputError
 from g2ard.io import read_cloud, write_points
 from g2ard.io.tile_store import packed
 from g2ard.io.types import Points
+from g2ard.progress import silent
 from g2ard.stages.lift import LiftConfig, lift
+from g2ard.tiles.executor import executor
 from g2ard.tiles.ingest import ingest
 from helpers import cloud_files
 from helpers.ingested import as_set, halos_of, saved, tiles_of, town
 from helpers.interruptions import interrupt_at
+from helpers.level_files import files_of
 from helpers.opened import stream_of
 from helpers.ply_files import save
 
@@ -121,16 +125,46 @@ def test_several_clouds_are_one(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("stage", ["sample", "tiles", "lift"])
-def test_an_interruption_leaves_nothing(tmp_path: Path, stage: str) -> None:
+def test_an_interrupted_lift_continues_where_it_was(tmp_path: Path, stage: str) -> None:
     path, folder = ply(tmp_path / "cloud.ply", streets(3000)), tmp_path / "tiles"
     whole = ingest(path, tmp_path / "whole", tile_rows=800)
     with pytest.raises(KeyboardInterrupt):
         ingest(path, folder, tile_rows=800, block_rows=300, progress=interrupt_at(stage, 1200))
-    assert not folder.exists()
-    store = ingest(path, folder, tile_rows=800)
+    assert folder.exists() == (stage == "lift")
+    stages = []
+    told = list(folder.glob(".points/lifted-*"))
+    store = ingest(path, folder, tile_rows=800, progress=lambda *words: stages.append(words))
+    begun = next(done for name, done, *_ in stages if name == "lift")
+    assert bool(told) == ("tiles" not in {name for name, *_ in stages}) == (begun > 0) == (stage == "lift")
+    assert not list(folder.glob(".*"))
+    assert files_of(folder) == files_of(whole.folder)
     assert (store.tiles, store.key) == (whole.tiles, whole.key)
     manifest = json.loads((folder / "tiles.json").read_text())
     assert manifest["settings"]["lift"]["neighbors"] == 10
+
+
+def test_points_of_another_cloud_are_not_continued(tmp_path: Path) -> None:
+    folder = tmp_path / "tiles"
+    for seed, progress in ((0, interrupt_at("lift", 1200)), (1, silent)):
+        path = ply(tmp_path / f"{seed}.ply", streets(3000, seed))
+        with nullcontext() if seed else pytest.raises(KeyboardInterrupt):
+            ingest(path, folder, tile_rows=800, progress=progress)
+    assert files_of(folder) == files_of(ingest(path, tmp_path / "whole", tile_rows=800).folder)
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_progress_moves_within_a_tile(tmp_path: Path, workers: int) -> None:
+    path, seen = ply(tmp_path / "cloud.ply", streets(120_000)), list[int]()
+
+    def told(stage: str, done: int, total: int, info: object = None) -> None:
+        if stage == "lift":
+            seen.append(done)
+
+    with executor(workers) as runs:
+        store = ingest(path, tmp_path / "tiles", tile_rows=70_000, runs=runs, progress=told)
+    assert {0, 120_000} < set(seen)
+    if workers == 1:  # a worker tells twice a second
+        assert len(set(seen)) > 2 * len(store.tiles)
 
 
 def test_bad_points_are_dropped_and_noted(tmp_path: Path) -> None:
