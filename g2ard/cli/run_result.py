@@ -38,11 +38,11 @@ def tell_run(
         source: what was distilled.
         page: line about the page.
     """
-    from g2ard.report.run import COLUMNS, cells
+    from g2ard.report.run import COLUMNS, rows_of
 
     run.say(counts_line(report))
     title = f"held-out views against {report.against}, {report.size}, {report.stages}:"
-    run.console.table(title, list(COLUMNS), cells(report.kinds))
+    run.console.table(title, list(COLUMNS), rows_of(report))
     for line in told(report, verbose=run.verbose):
         run.say(line)
     say_views(run, report.views, job.config.select.views_count is not None)

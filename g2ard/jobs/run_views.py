@@ -333,7 +333,8 @@ def _mixed(
     spare, focus = max(_LEAST_APART, round(_VIEWS_APART * times * share)), select.focus
     least = round(_TRAINING_VIEWS * times * share)
     grown = max(1.0, min(usual / (_TRAINING_VIEWS * share), _POOL_GROWTH * times))
-    wanted = dict.fromkeys(_OTHER_KINDS, round(_OFFERED_VIEWS * grown * share))
+    usual_most = round(_OFFERED_VIEWS * grown * share)
+    wanted = dict.fromkeys(_OTHER_KINDS, usual_most)
     if focus == "far":
         wanted = {"near": 0}
     elif focus is not None:
@@ -341,12 +342,16 @@ def _mixed(
     offered: list[Camera] = []
     apart: list[Camera] = []
     for kind, most in wanted.items():
-        cameras = planned.more(kind, most + spare)
-        taken = min(most, max(len(cameras) - spare, len(cameras) // 2))
-        if kind == focus and taken < 0.9 * most:
-            say(f"warning: --focus {kind}: the scene has room for {taken} such views, {most} are wanted")
-        offered += cameras[:taken]
-        apart += cameras[taken:]
+        cameras = planned.more(kind, usual_most + spare)
+        taken = min(usual_most, max(len(cameras) - spare, len(cameras) // 2))
+        learned, scored = cameras[:taken][:most], cameras[taken:]  # scored alike with and without a focus
+        if len(learned) < most:
+            learned += _elsewhere(planned.more(kind, most + spare), cameras)[: most - len(learned)]
+        if kind == focus and len(learned) < 0.9 * most:
+            room = f"room for {len(learned)} such views, {most} are wanted"
+            say(f"warning: --focus {kind}: the scene has {room}")
+        offered += learned
+        apart += scored
     others = Cameras.of(apart).fitted(size) if apart else None
     more, unseen = Cameras.of(offered) if offered and learns else None, None
     if focus is None and more is not None and rough:
@@ -376,6 +381,13 @@ def _mixed(
     if focus is None and zoom and not rough:
         mixed = replace(mixed, cameras=zoomed(compact, mixed.cameras, represents=per_row, share=share))
     return mixed, others, unseen
+
+
+def _elsewhere(views: Sequence[Camera], others: Sequence[Camera]) -> list[Camera]:
+    """Return the views that stand where none of the others does, with names that these do not have."""
+    places = np.array([view.position for view in others]).reshape(-1, 3)
+    found = [view for view in views if not np.isclose(places, view.position).all(axis=1).any()]
+    return [replace(view, name=f"{view.name} (more)") for view in found]
 
 
 def _compact(prior: Splats, count: int, represents: float, progress: Progress) -> tuple[Splats, float]:

@@ -21,7 +21,7 @@ from g2ard.rendering.sky import over_sky, seen_on_sky
 from g2ard.rendering.targets import Targets, mask_of
 from g2ard.report.labels import DENSE, RESULT, TARGET, labels_of
 from g2ard.report.page import Page, Shown
-from g2ard.report.run import COLUMNS, LOST, KindScore, RunReport, cells
+from g2ard.report.run import COLUMNS, LOST, KindScore, RunReport, rows_of
 from g2ard.report.sheet import contact_sheet
 from g2ard.scene.cameras import Cameras, rows_by_kind
 from g2ard.scene.splats import Splats
@@ -122,8 +122,9 @@ def distill_report(
     )
     show(best)
     page.heading("Scores")
-    page.table(COLUMNS, cells(report.kinds))
-    page.paragraph(f"PSNR and SSIM: {report.stages}, in views of {report.size}.")
+    page.table(COLUMNS, rows_of(report))
+    below = ", below the first row" if report.own_size else ""
+    page.paragraph(f"PSNR and SSIM: {report.stages}, in views of {report.size}{below}.")
     if edges := edges_line(report.kinds):
         page.paragraph(edges)
     for line in told:

@@ -119,6 +119,23 @@ def cells(kinds: Iterable[KindScore]) -> list[list[str]]:
     ]
 
 
+def rows_of(report: RunReport) -> list[list[str]]:
+    """Return the rows of a run's table, the views' own size first if another one was requested."""
+    if report.own_size is None:
+        return cells(report.kinds)
+    before, after = (report.own_size[name] for name in ("simplified", "recovered"))
+    views, size = after.scored_in.split()[0], after.scored_in.rpartition(", ")[2]
+    first = [
+        f"full size, {size}",
+        views,
+        f"{before.psnr:.2f} → {after.psnr:.2f}",
+        "–",
+        "–" if math.isnan(after.detail) else f"{before.detail:.2f} → {after.detail:.2f}",
+        f"{before.ssim:.4f} → {after.ssim:.4f}",
+    ]
+    return [first, *cells(report.kinds)]
+
+
 @dataclass(frozen=True)
 class ViewsReport(Report):
     """Report of the view selection.

@@ -82,6 +82,27 @@ def test_views_of_other_kinds_join_the_usual_ones(make, focus: str | None, kinds
     assert len(views.pool.cameras) == len(views.train.cameras) + len(views.test)
 
 
+@pytest.mark.parametrize("focus", ["far", "near", "standing", "anywhere"])
+def test_runs_with_a_focus_are_scored_in_the_views_of_others(focus: str) -> None:
+    """So their scores can be compared, and none of the views trains the other run."""
+    statue = naive.statue()
+    plain, focused = (
+        views_of(statue, DistillOptions(views="made", settings={"focus": kind, "steps": 1400}), 300)
+        for kind in (None, focus)
+    )
+    np.testing.assert_array_equal(focused.test.viewmats, plain.test.viewmats)
+    assert focused.apart is not None
+    assert plain.apart is not None
+    for kind, rows in rows_by_kind(focused.apart.kinds).items():
+        same = rows_by_kind(plain.apart.kinds)[kind]
+        np.testing.assert_array_equal(focused.apart.viewmats[rows], plain.apart.viewmats[same])
+    scored, trained = (
+        {tuple(pose) for pose in cameras.viewmats.round(9).reshape(-1, 16)}
+        for cameras in (focused.apart, focused.train.cameras)
+    )
+    assert not scored & trained
+
+
 def test_views_of_other_kinds_weigh_a_twentieth_in_simplification() -> None:
     statue = naive.statue()
     pool = plan_pool(statue, 16)

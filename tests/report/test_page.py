@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from g2ard.report.distilled import _worst, verdict
-from g2ard.report.run import RunReport, by_kind
+from g2ard.report.run import RunReport, by_kind, rows_of
 from g2ard.stages.evaluate import Means, ViewScore
 from helpers.commands import CommandLine, succeeds
 from helpers.studies import check_page, study
@@ -56,3 +56,8 @@ def test_the_verdict_names_the_weakest_kind_of_view() -> None:
     full = Means(26.04, 0.8, 30, 0.9, "5 photos, 96×72 px")
     told = verdict(replace(report, own_size={"recovered": full}))
     assert "at 26.0 dB in 5 photos, 96×72 px, the views' own size; at 29.8 dB, the mean of 5" in told
+    sizes = {"simplified": replace(full, psnr=24.5), "recovered": full}
+    first, *others = rows_of(replace(report, own_size=sizes))
+    assert first[:3] == ["full size, 96×72 px", "5", "24.50 → 26.04"]
+    assert others == rows_of(report)
+    assert rows_of(report)[0][0] == "usual"
