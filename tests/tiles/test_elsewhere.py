@@ -4,20 +4,23 @@ from collections.abc import Iterator
 from inspect import signature
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from g2ard.cli.app import app, register_commands
 from g2ard.cli.budget_options import TILES
+from g2ard.io import write_points
+from g2ard.io.types import Points
 from helpers.commands import CommandLine, succeeds
 from helpers.level_files import files_of
-from helpers.tiled_scenes import town_in
+from helpers.tiled_scenes import town, town_in
 
 CALLS = {
     "simplify": "simplify town.ply -r 10 -o OUT/small.ply",
     "distill": "distill town.ply -r 10 -o OUT/run --steps 4 --size 48 --no-page",
-    "lod": "lod town.ply -r 2,8 -o OUT/levels --merge-only",
+    "lod": "lod cloud.ply -r 2,8 -o OUT/levels --merge-only",
 }
-"""A call of each command with the options of tiles."""
+"""A call of each command with the options of tiles, of a scene or of a cloud, which workers lift."""
 
 NAMED = ("report.json", "report.html", "index.html")
 """Files that hold times, options or the output's name."""
@@ -40,6 +43,8 @@ def test_relative_paths_are_the_clients(
     name: str, work: tuple[str, ...], scheduler: str, command_line: CommandLine, tmp_path: Path
 ) -> None:
     town_in(tmp_path, 1600)
+    points = town(1600).means.astype(float)
+    write_points(tmp_path / "cloud.ply", Points(points, np.full((1600, 3), 0.5, np.float32)))
     files = []
     for out, where in (("here", ("--workers", "1")), ("there", ("--scheduler", scheduler))):
         call = (*CALLS[name].split(), *work, "--views", "views.json", "--tile-rows", "700")
