@@ -286,6 +286,7 @@ def _auto(survey: Survey, count: int) -> tuple[dict[str, Poses], str]:
     hidden = missing() > 0 and is_hidden(survey)
     if hidden:
         why.append("a ceiling hides it from around and above")
+        add("walk", plan_walk(survey, missing(), indoors=True))
         add("walk", plan_walk(survey, missing()))
         add("sharp", plan_sharp(survey, missing()))
     if missing() and not hidden:

@@ -109,12 +109,13 @@ def plan_inside(survey: Survey, count: int) -> Poses:
     return gather(survey, count if len(places) else 0, tried)
 
 
-def plan_walk(survey: Survey, count: int, shift: int = 0) -> Poses:
+def plan_walk(survey: Survey, count: int, shift: int = 0, *, indoors: bool | None = None) -> Poses:
     """Plan at most `count` poses at eye height in connected free space, gazing all around.
 
-    Gazes into a near wall or leaves, or out of the scene, are dropped.
+    Gazes into a near wall or leaves, or out of the scene, are dropped. `indoors`, places lie between walls;
+    otherwise under an open sky. None means indoors if the scene is a room.
     """
-    site, indoors = survey.site, is_room(survey)
+    site, indoors = survey.site, is_room(survey) if indoors is None else indoors
     sides = site.box[1] - site.box[0]
     tall = sides[2] if indoors else site.tallness
     far = 0.4 * min(sides[:2]) if indoors else 0.6 * tall

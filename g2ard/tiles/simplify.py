@@ -136,7 +136,7 @@ def visibility(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
     Returns:
         `weight`, (N,) float32 Σ αT² over all views; `pixel_size`, (N,) float32 size of a full-image pixel,
         scene units, infinite if no view shows the row; `pixel`, the median of the finite ones, NaN if there
-        are none; `sums`, (2,) `emphasised` weight and mass of the kept rows, for the frame's floor; `used`,
+        are none; `sums`, (3,) of the kept rows' `emphasised` weights, for the frame; `used`,
         numbers of the rendered views; `share`, their part of `all_light`, by which `weight` was divided;
         `near`, their near plane.
     """

@@ -88,7 +88,7 @@ def test_one_tile_is_the_whole_to_the_bit(seen: bool) -> None:
         return _core.TileMerging(prepared.core, frame, config, Seen() if seen else None)
 
     if seen:
-        frame = frame.with_views(0.01, 1, 1)
+        frame = frame.with_views(0.01, 1, 1, 1)
         frame = frame.with_views(0.01, *tile(frame).sums())
     here = tile(frame)
     assert len(here.run_costs(2.0)) < len(prepared)  # the transparent are not among them

@@ -1,6 +1,6 @@
 //! `_core.TileMerging`: simplification of one tile, in steps that all tiles share.
 
-use g2ard_core::simplify::{Frame, Importance, Pairwise, Tile};
+use g2ard_core::simplify::{Frame, Importance, Pairwise, Sums, Tile};
 use numpy::{PyArray1, PyReadonlyArray1};
 use pyo3::prelude::*;
 use pyo3::types::{PyDict, PyTuple};
@@ -23,11 +23,12 @@ pub struct PyFrame(Frame);
 impl PyFrame {
     /// `importance`: exponent, usual mass, the place's three coordinates, reach and angular share.
     #[new]
-    #[pyo3(signature = (unit, pixel_size, floor, *importance))]
+    #[pyo3(signature = (unit, pixel_size, floor, even, *importance))]
     fn new(
         unit: f64,
         pixel_size: f32,
         floor: f32,
+        even: f32,
         importance: &Bound<'_, PyTuple>,
     ) -> PyResult<Self> {
         let [exponent, usual, x, y, z, reach, angular] = importance.extract()?;
@@ -35,6 +36,7 @@ impl PyFrame {
             unit,
             pixel_size,
             floor,
+            even,
             importance: Importance {
                 exponent,
                 usual,
@@ -57,8 +59,13 @@ impl PyFrame {
     }
 
     /// The frame with views: the usual size of a pixel, and `sums` added up over all tiles.
-    fn with_views(&self, pixel_size: f32, weight: f64, mass: f64) -> Self {
-        Self(self.0.with_views(pixel_size, weight, mass))
+    fn with_views(&self, pixel_size: f32, weight: f64, mass: f64, per_pixel: f64) -> Self {
+        let sums = Sums {
+            weight,
+            mass,
+            per_pixel,
+        };
+        Self(self.0.with_views(pixel_size, sums))
     }
 
     /// The arguments of the constructor.
@@ -67,10 +74,11 @@ impl PyFrame {
             unit,
             pixel_size,
             floor,
+            even,
             importance,
         } = self.0;
         let [x, y, z] = importance.place;
-        let of_scene = [unit, pixel_size.into(), floor.into()];
+        let of_scene = [unit, pixel_size.into(), floor.into(), even.into()];
         let of_rows = [importance.exponent, importance.usual];
         let of_place = [x, y, z, importance.reach, importance.angular];
         [&of_scene[..], &of_rows, &of_place].concat()
@@ -121,9 +129,10 @@ impl PyTileMerging {
         }
     }
 
-    /// Return Σ αT² of the views, and mass, of the kept rows.
-    fn sums(&self, py: Python<'_>) -> PyResult<(f64, f64)> {
-        self.with(py, |tile| long(py, None, |_| tile.sums()))
+    /// Return sums over the kept rows: Σ αT² of the views, mass, and Σ αT² per pixel.
+    fn sums(&self, py: Python<'_>) -> PyResult<(f64, f64, f64)> {
+        let sums = self.with(py, |tile| long(py, None, |_| tile.sums()))?;
+        Ok((sums.weight, sums.mass, sums.per_pixel))
     }
 
     /// Return the cost of closing each gap between neighbours in Morton order, from the first kept row on, for runs of

@@ -151,6 +151,11 @@ impl Importance {
         }
     }
 
+    /// How far small Gaussians carry the detail in a scene that says where people stand, 0 to 1.
+    pub fn small_carry_detail(&self) -> f64 {
+        (1.0 - self.exponent) * self.angular
+    }
+
     /// A mass as it looks from where people stand, at least as far away as they walk about.
     pub fn apparent(&self, mean: [f32; 3], mass: f32) -> f32 {
         if self.angular == 0.0 {

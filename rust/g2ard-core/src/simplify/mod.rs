@@ -25,7 +25,7 @@ pub use clusters::Pair;
 pub use guards::{coverage, disc};
 pub use importance::Importance;
 pub use kernels::{Group, GroupKernels, means_of};
-pub use leaves::{Frame, Visibility};
+pub use leaves::{Frame, Sums, Visibility};
 pub use moments::{Merged, merge, optical_mass, pool, weights};
 pub use outcome::Outcome;
 pub use pairwise::{Pairwise, PairwiseRound};

@@ -522,8 +522,7 @@ mod tests {
             frame,
         };
         if visibility.is_some() {
-            let (weight, mass) = tile.sums().unwrap();
-            frame = frame.with_views(0.01, weight, mass);
+            frame = frame.with_views(0.01, tile.sums().unwrap());
             tile.frame = frame;
         }
         let runs = 20;
@@ -656,8 +655,7 @@ mod tests {
                 visibility: Some(seen),
                 frame: Frame { unit, ..frame },
             };
-            let (weight, mass) = tile.sums().unwrap();
-            tile.frame = tile.frame.with_views(0.01, weight, mass);
+            tile.frame = tile.frame.with_views(0.01, tile.sums().unwrap());
             let costs = tile.run_costs(2.0).unwrap();
             (tile.plan(30, &[5], &costs, &control).unwrap(), costs)
         };

@@ -8,7 +8,7 @@
 
 use super::clusters::{Pair, Partition};
 use super::cost::Weights;
-use super::leaves::{Frame, Leaves, Visibility, floor, unit};
+use super::leaves::{Frame, Leaves, Sums, Visibility, unit};
 use super::morton_tree::{cut, merge_costs};
 use super::pairwise::{PairwiseRound, longest};
 use super::rows::Rows;
@@ -27,15 +27,17 @@ impl Frame {
             unit: unit(scene, ordered, &blur),
             pixel_size,
             floor: 0.0,
+            even: 0.0,
             importance: leaves.importance(),
         }
     }
 
     /// The same with views: the median size of a pixel, and the sums of [`Tile::sums`] over all tiles.
-    pub fn with_views(self, pixel_size: f32, weight: f64, mass: f64) -> Self {
+    pub fn with_views(self, pixel_size: f32, sums: Sums) -> Self {
         Self {
             pixel_size,
-            floor: floor(weight, mass),
+            floor: sums.floor(),
+            even: sums.even(&self.importance),
             ..self
         }
     }
@@ -62,8 +64,8 @@ pub struct Tile<'a> {
 }
 
 impl Tile<'_> {
-    /// Σ αT² of the views, and mass, of the rows that are kept; the frame's floor is not read.
-    pub fn sums(&self) -> Result<(f64, f64)> {
+    /// Sums over the rows that are kept; the frame's own are not read.
+    pub fn sums(&self) -> Result<Sums> {
         let blur = self.blurs();
         Ok(self.leaves(&blur)?.sums())
     }
