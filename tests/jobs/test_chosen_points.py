@@ -131,6 +131,8 @@ def test_every_command_that_lifts_takes_the_choice(tmp_path: Path, command_line:
     succeeds(command_line, tmp_path, "simplify", path, "-n", ground, "--no-views", "-o", "c.ply", *choice)
     scenes = [g2ard.load(tmp_path / f"{name}.ply") for name in "abc"]
     assert [len(scene) for scene in scenes] == [ground] * 3
+    larger = succeeds(command_line, tmp_path, "convert", path, "larger.ply").err
+    assert "smaller: g2ard convert larger.ply larger.sog" in larger
     np.testing.assert_array_equal(scenes[0].means, scenes[1].means)
     words = ("-n", 20, "--steps", 1, "--size", 32, "--no-page", "-o", "run")
     assert f"{ground:,} points → 20" in succeeds(command_line, tmp_path, "distill", path, *words, *choice).err

@@ -12,6 +12,7 @@ from g2ard.cli.command import command
 from g2ard.cli.fields import ShDegreeOption
 from g2ard.cli.options import numbers
 from g2ard.cli.run import Run
+from g2ard.cli.run_result import say_weight
 from g2ard.config.choices import NAMED_AXES, Axes, AxesName, PlyLayout, PointColor
 from g2ard.errors import InputError, OutputError
 from g2ard.io import Source
@@ -163,6 +164,8 @@ def convert(
         write_table(output, splats, overwrite=run.overwrite)
     else:
         run.write(output, splats, compare=True, **options)
+    if isinstance(opened, Source) and not as_table:
+        say_weight(run, opened.path, output, splats)
     size = written_bytes(output)
     kept = f"{len(splats):,}" if len(splats) == read else f"{len(splats):,} of {read:,}"
     what = "Gaussian" if kept == "1" else "Gaussians"
