@@ -278,7 +278,8 @@ def check_job_memory(job: Any, most: int | None, need: int) -> None:
     count = job.total
     message = f"--memory: {plural(count, 'Gaussian')} in one piece take about {amount(need, ceil=True)}, "
     if job.plan is not None:
-        message = f"--memory: recovering {plural(job.budget.count, 'Gaussian')} takes about "
+        largest = round_counts(job.dense, job.budget.count, job.config)[0]
+        message = f"--memory: recovering {plural(largest, 'Gaussian')} takes about "
         message += f"{amount(need, ceil=True)}, "
     message += f"more than {amount(most)}; smaller views, --size, take less"
     if job.plan is None and job.renders:  # tiles support this job
