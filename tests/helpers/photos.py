@@ -3,9 +3,10 @@
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from PIL import Image
 
 import g2ard
@@ -32,14 +33,18 @@ def photographed(
     return replace(views, image_paths=paths)
 
 
-def cloud_of(path: Path, scene: g2ard.Splats, origin: ArrayLike = 0) -> None:
-    """Write the means of a scene, moved to `origin`, as a coloured .ply, .las or .laz cloud."""
+def cloud_of(path: Path, scene: g2ard.Splats, origin: ArrayLike = 0, **fields: NDArray[Any]) -> None:
+    """Write the means of a scene, moved to `origin`, as a coloured .ply, .las or .laz cloud.
+
+    Args:
+        fields: further columns of a .las or .laz, each (N,).
+    """
     colors = np.clip(0.5 + SH_C0 * scene.sh0[:, 0], 0, 1).astype(np.float32)
     points = scene.means.astype(np.float64) + np.asarray(origin)
     if path.suffix == ".ply":
         write_points(path, Points(points, colors))
     else:
-        las(path, points, np.rint(colors * 65535).astype(np.uint16))
+        las(path, points, np.rint(colors * 65535).astype(np.uint16), **fields)
 
 
 def cloud_with_photos(folder: Path, scene: g2ard.Splats) -> None:

@@ -89,7 +89,8 @@ def _cloud(path: Path) -> None:
 
 
 def _map_cloud(path: Path) -> None:
-    cloud_of(path, SCENE, ESTONIA)
+    rows = np.arange(len(SCENE))
+    cloud_of(path, SCENE, ESTONIA, classification=(rows % 2 + 2).astype("u1"), intensity=rows.astype("u2"))
 
 
 def _photos(folder: Path) -> None:
@@ -233,6 +234,7 @@ PLACEHOLDERS = {
     **dict.fromkeys(("PLAYBOT", "GUITAR", "SCENE", "SCENE…", "PATH"), "scene.ply"),
     "VIEWS": "photos",
     "DIR": "out",
+    "636800,851000,400,637400,851600,700": "542200,6589100,0,542400,6589300,60",
     "tcp://HOST:8786": "local",
     "/shared/work": "work",
 }
