@@ -215,13 +215,14 @@ class RunFolder:
         line = ""
         if self._run.config["page"]:
             dense, config = None, self._run.config
+            of_points = isinstance(source, Source) and source.kind == "points"
             alone = not config["compare"] or str(config["fit"]).startswith("page:")
             if not alone and isinstance(source, Source) and not recover.from_points and job.plan is None:
                 dense = source, job.prior
             seen = job.views.train.cameras if job.views.pool is None else best.cameras
             size = None
             with self._run.showing("view.html"):
-                size, line = self.write_view(done.splats, dense, seen, recover.background)
+                size, line = self.write_view(done.splats, dense, seen, recover.background, of_points)
             report = replace(report, bytes={**report.bytes, "view": size})
         with self._run.showing("report.html"):
             files = {self.scene.name: self.scene.name, "view in the browser": self._view.name, "folder": "."}
@@ -238,7 +239,12 @@ class RunFolder:
             temporary.write_text(text + "\n", encoding="utf-8", newline="\n")
 
     def write_view(
-        self, splats: Splats, dense: tuple[Source, Splats] | None, cameras: Cameras, background: Colour
+        self,
+        splats: Splats,
+        dense: tuple[Source, Splats] | None,
+        cameras: Cameras,
+        background: Colour,
+        of_points: bool = False,
     ) -> tuple[int | None, str]:
         """Write view.html unless browsers would not draw the scene smoothly; return its bytes, None if it was
         not written, and a line to print.
@@ -246,12 +252,13 @@ class RunFolder:
         Args:
             dense: file of the dense scene and the scene, shown left of the result unless it would make the
                 page large.
+            of_points: whether that scene is a point cloud.
         """
         count, most = len(splats), DEVICES["web"]
         if count > most:
             return None, f"{self._view} skipped: over {most:,} Gaussians (`g2ard view` writes it anyway)"
         stand = frame_with(splats, cameras)
-        behind = self._backdrop(background, splats if dense is None else dense[1])
+        behind = self._backdrop(background, splats if dense is None else dense[1], of_points)
         shown: list[Source | str] = [names_of([self.path])[0]]
         scenes, roles = [splats], [RESULT]
         if dense is not None and count < len(dense[1]) <= LARGEST_DENSE:
@@ -262,9 +269,9 @@ class RunFolder:
         return written, f"view: {self._view} ({written / 1e6:.2f} MB)"
 
     @staticmethod
-    def _backdrop(background: Colour, scene: Splats) -> Colour | None:
+    def _backdrop(background: Colour, scene: Splats, of_points: bool = False) -> Colour | None:
         """Return what is behind a scene in pictures and on pages, see `backdrop`."""
-        return backdrop(None if background == BLACK else background, [scene])
+        return backdrop(None if background == BLACK else background, [scene], of_points=of_points)
 
     def say_files(self, page: str = "") -> None:
         """Name the files, and record that the run is finished."""

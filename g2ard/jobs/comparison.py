@@ -13,6 +13,7 @@ from g2ard.errors import InputError
 from g2ard.io.detect import run_background, run_scene, run_views
 from g2ard.io.jsonfile import read_json
 from g2ard.io.paths import real_path
+from g2ard.io.source import Source
 from g2ard.io.types import ViewSet
 from g2ard.jobs.inputs import Views, load_split_views
 from g2ard.rendering.targets import RENDERS, Targets, scored_in
@@ -88,6 +89,12 @@ def source_of(path: Path) -> Path | None:
     config = read_json(path / "report.json").get("config", {}) if is_run(path) else {}
     scene = config.get("scene")
     return None if scene is None else real_path(Path(scene))
+
+
+def made_of_points(path: Path) -> bool:
+    """Return whether a scene is a point cloud, or was made of one: a run's result, or its scene file."""
+    dense = source_of(path if path.is_dir() else path.parent) or path
+    return dense.exists() and Source(dense).kind == "points"
 
 
 def dense_first(first: Path, second: Path) -> tuple[list[Path], tuple[str, ...]]:

@@ -22,6 +22,7 @@ from g2ard.io.reports import Report
 from g2ard.io.scenes import tell
 from g2ard.io.tile_store import TileStore
 from g2ard.jobs.budget import Budget
+from g2ard.jobs.comparison import made_of_points
 from g2ard.jobs.cost import Cost, cost_of
 from g2ard.jobs.distill import DistillJob, preparing
 from g2ard.jobs.distill_options import DistillOptions
@@ -423,7 +424,9 @@ def write_level_page(
     coarse = levels[-1]
     few = coarse.take(np.array(evenly_spaced(len(coarse), _ROWS, floor=True)))
     frame = frame_of(few, given)
-    behind = backdrop(background, [few])
+    finest = levels[0].take(np.array(evenly_spaced(len(levels[0]), _ROWS, floor=True)))
+    of_points = given.beside is not None and made_of_points(Path(given.beside))
+    behind = backdrop(background, [finest], of_points=of_points)
     page, offset = folder / "index.html", np.asarray(few.offset)
     title = names_of([Path(given.beside or folder)])[0]
     if kind == "sog":
@@ -434,7 +437,7 @@ def write_level_page(
             page, title, start=frame.start, antialiased=antialiased, background=behind, **placed
         )
     reach = float(np.linalg.norm(np.ptp(few.means, axis=0)))
-    start = frame.start or Start((0.0, reach / 4, -reach), (0.0, 0.0, 0.0), (60.0, 45.0))
+    start = frame.start or Start((0.0, reach / 4, -reach), (0.0, 0.0, 0.0), ((1.0, 60.0),))
     eye, target = (
         (TILE_OF_SCENE @ (frame.world(point) - offset)).tolist() for point in (start.position, start.target)
     )

@@ -17,6 +17,7 @@ from g2ard.config.choices import Colour
 from g2ard.errors import InputError
 from g2ard.io import Source
 from g2ard.io.images import load_photo, png_bytes, resized
+from g2ard.jobs.comparison import made_of_points
 from g2ard.jobs.inputs import GivenViews, Views, load_scene
 from g2ard.jobs.viewer_frame import backdrop, frame_of
 from g2ard.poses import best_views
@@ -99,7 +100,7 @@ def view(
         page,
         [(label, stand.of(splats)) for label, splats in zip(labels, loaded, strict=True)],
         start=stand.start,
-        background=backdrop(background, loaded),
+        background=backdrop(background, loaded, of_points=beside is not None and made_of_points(beside)),
         overwrite=overwrite,
         progress=progress,
     )

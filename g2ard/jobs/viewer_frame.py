@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from g2ard.config.checks import checks_arguments
 from g2ard.config.choices import BLACK, Axes, Colour
 from g2ard.errors import InputError
+from g2ard.jobs.framing import Fields, fields_of
 from g2ard.jobs.inputs import GivenViews, load_views
 from g2ard.jobs.view_checks import given_or_found, opaque_points
 from g2ard.poses import best_views
@@ -78,8 +79,11 @@ class ViewerFrame:
         back: NDArray[np.float64] = self.rotation.T @ _TO_VIEWER @ np.asarray(point) + self.origin
         return back
 
-    def start_at(self, view: Camera, points: NDArray[np.float64]) -> Start:
-        """Convert a view for the viewer, without roll; it orbits the median depth of the points in view."""
+    def start_at(self, view: Camera, points: NDArray[np.float64], fields: Fields | None = None) -> Start:
+        """Convert a view for the viewer, without roll; it orbits the median depth of the points in view.
+
+        Without `fields`, all of the view fits into the window.
+        """
         held = points[view.holds(points)]
         if not len(held):
             held = self.origin[None]
@@ -91,9 +95,7 @@ class ViewerFrame:
             x, y, z = (float(v) for v in to_viewer @ (point - self.origin))
             return x, y, z
 
-        sides = np.array([view.width, view.height]) / np.diag(view.K)[:2]
-        across, down = (float(v) for v in np.degrees(2 * np.arctan(sides / 2)))
-        return Start(there(view.position), there(view.position + depth * ahead), (across, down))
+        return Start(there(view.position), there(view.position + depth * ahead), fields or fields_of(view))
 
 
 def frame_of(
@@ -124,17 +126,22 @@ def frame_of(
 def frame_with(
     scene: Splats, cameras: Cameras | None, up: Sequence[float] | None = None, *, start: str | None = None
 ) -> ViewerFrame:
-    """Choose a frame and an initial camera, from given cameras if there are any, like `frame_of`."""
+    """Choose a frame and an initial camera, from given cameras if there are any, like `frame_of`.
+
+    A view that was named is shown whole, others as near as their subject allows. Of photos, only what was
+    photographed is shown.
+    """
     up = stated_up(scene) if up is None else up
     axis = level_up(cameras) if up is None and cameras is not None else None
     axis = up_of(scene, up) if axis is None else axis
-    if cameras is None or start is None:
-        cameras = best_views(scene, cameras=cameras, axis=axis)
-    if start and start not in cameras.names:
-        raise InputError(f"no view {start!r} among {', '.join(cameras.names[:4])}, …", parameter="start")
-    view = cameras[cameras.names.index(start) if start else 0]
-    stand = ViewerFrame(_turn(axis), _middle(scene))
-    return replace(stand, start=stand.start_at(view, opaque_points(scene)), name=view.name)
+    best = best_views(scene, cameras=cameras, axis=axis) if cameras is None or start is None else cameras
+    if start and start not in best.names:
+        raise InputError(f"no view {start!r} among {', '.join(best.names[:4])}, …", parameter="start")
+    view = best[best.names.index(start) if start else 0]
+    stand, points = ViewerFrame(_turn(axis), _middle(scene)), opaque_points(scene)
+    photos = cameras if cameras is not None and any(cameras.image_paths) else None
+    fields = fields_of(view, subject=None if start else points, scene=scene, photos=photos)
+    return replace(stand, start=stand.start_at(view, points, fields), name=view.name)
 
 
 def best_level(scene: Splats, count: int, cameras: Cameras, size: tuple[int, int] = (800, 600)) -> Cameras:
@@ -142,12 +149,12 @@ def best_level(scene: Splats, count: int, cameras: Cameras, size: tuple[int, int
     return best_views(scene, count, size=size, axis=level_up(cameras))
 
 
-def backdrop(given: Colour | None, scenes: Sequence[Splats]) -> Colour | None:
+def backdrop(given: Colour | None, scenes: Sequence[Splats], *, of_points: bool = False) -> Colour | None:
     """Return the colour behind scenes on a page: the given one, or black, on which scenes are trained.
 
-    None, a soft gradient, is behind lifts of point clouds: they were trained on nothing, and have gaps.
+    None, a soft gradient, is behind lifts of point clouds and what was made `of_points`, which have gaps.
     """
-    if given is not None:
+    if given is not None or of_points:
         return given
     samples = (scene.take(np.array(evenly_spaced(len(scene), _SAMPLE, floor=True))) for scene in scenes)
     return None if any(measure_prior(sample).is_lift for sample in samples) else BLACK

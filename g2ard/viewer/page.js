@@ -18,11 +18,10 @@ async function module(base64) {
 
 const { start, stops, background, files, antialiased, placed } = JSON.parse(read('view'));
 
-// The viewer's field of view is along the window's longer side; all of the given view is to be in sight.
+// The viewer's field of view is along the window's longer side.
 function fitted({ position, target, fov }) {
-  const [x, y] = fov.map(degrees => Math.tan(degrees * Math.PI / 360));
-  const half = innerWidth >= innerHeight ? Math.max(x, y * innerWidth / innerHeight)
-    : Math.max(y, x * innerHeight / innerWidth);
+  const aspect = innerWidth / innerHeight;
+  const half = halfHeight(fov, aspect) * Math.max(1, aspect);
   return { position, target, fov: Math.min(120, Math.max(10, Math.atan(half) * 360 / Math.PI)) };
 }
 
@@ -215,6 +214,23 @@ function divide(right, leader) {
   place(0.5);
 }
 
+// Tab leads to the controls, which the viewer hides after some seconds, and to its switches, which are no buttons.
+function reachByTab({ events }) {
+  addEventListener('keydown', event => {
+    if (event.key === 'Tab') events.fire('inputEvent', 'interact');
+  }, true);
+  for (const control of document.querySelectorAll('.sse-toggleSwitch')) {
+    control.tabIndex = 0;
+    control.role = 'button';
+    control.ariaLabel = control.previousElementSibling.textContent;
+    control.addEventListener('keydown', event => {
+      if (event.key !== 'Enter' && event.key !== ' ') return;
+      event.preventDefault();
+      control.click();
+    });
+  }
+}
+
 async function main() {
   if (placed && location.protocol === 'file:') {
     throw new Error('its levels are loaded over http. Run "python -m http.server" in their folder and open '
@@ -233,6 +249,7 @@ async function main() {
     follow(started[0].handle, started[1].handle);
     divide(right, started[0].handle);
   }
+  reachByTab(started[0].handle);
   await Promise.all(started.map(({ drawn }) => drawn));
   started[0].handle.events.fire('inputEvent', 'cancel'); // from the paused animation, which all scenes open with
   return started.map(({ handle }) => handle);

@@ -33,12 +33,13 @@ class Start:
 
     Args:
         target: centre of rotation, scene units.
-        fov: horizontal and vertical field of view in degrees, both of which fit into the window.
+        fov: vertical field of view in degrees for windows of rising aspects (width / height); between them,
+            its tangent is a power of the aspect.
     """
 
     position: tuple[float, float, float]
     target: tuple[float, float, float]
-    fov: tuple[float, float]
+    fov: tuple[tuple[float, float], ...]
 
 
 def check_page_output(path: str | Path, overwrite: bool = False) -> Path:
@@ -130,20 +131,20 @@ def write_globe_page(
     *,
     eye: Sequence[float],
     target: Sequence[float],
-    fov: Sequence[float],
+    fov: Sequence[tuple[float, float]],
     background: Sequence[float] | None = BLACK,
 ) -> int:
     """Write a page that shows the tileset.json of its own folder with a CesiumJS named in its address.
 
-    The initial camera is in the axes of the tiles, its fields of view in degrees, as in `Start`.
+    The initial camera is in the axes of the tiles, its fields of view as in `Start`.
     """
     view = {
         "eye": [float(x) for x in eye],
         "target": [float(x) for x in target],
-        "fov": [float(x) for x in fov],
+        "fov": [[float(aspect), float(degrees)] for aspect, degrees in fov],
         "background": _colour(background),
     }
-    text = (_HERE / "globe.html").read_text(encoding="utf-8")
+    text = _part("globe.html").replace("{fit}", _part("fit.js"))
     text = text.replace("{generator}", f"g2ard {__version__}").replace("{title}", escape(title))
     return _write(Path(path), text.replace("{view}", json.dumps(view)), overwrite=True)
 
@@ -177,22 +178,23 @@ def _label(text: str, *, switch: bool) -> str:
     return f'<button type="button" class="label" aria-pressed="false" title="{title}">{escape(text)}</button>'
 
 
-def _page(labels: Sequence[str], shown: object, packed: Sequence[bytes]) -> str:
-    def part(name: str) -> str:
-        return (_HERE / name).read_text(encoding="utf-8")
+def _part(name: str) -> str:
+    return (_HERE / name).read_text(encoding="utf-8")
 
+
+def _page(labels: Sequence[str], shown: object, packed: Sequence[bytes]) -> str:
     data = (
         f'<script type="text/plain" id="scene{index}">{base64.b64encode(sog).decode()}</script>'
         for index, sog in enumerate(packed)
     )
-    return part("page.html").format(
+    return _part("page.html").format(
         generator=f"g2ard {__version__}",
         title=escape(" | ".join(labels)),
-        notice=_NOTICE + part("supersplat/LICENSE"),
-        style=part("supersplat/index.css") + part("page.css"),
+        notice=_NOTICE + _part("supersplat/LICENSE"),
+        style=_part("supersplat/index.css") + _part("page.css"),
         labels="\n".join(_label(label, switch=len(labels) > 1) for label in labels),
         view=json.dumps(shown).replace("<", "\\u003c"),
         viewer=base64.b64encode((_HERE / "supersplat/index.js.gz").read_bytes()).decode(),
         scenes="\n".join(data),
-        script=part("page.js"),
+        script=_part("fit.js") + _part("page.js"),
     )

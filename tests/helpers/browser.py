@@ -124,6 +124,11 @@ class Browser:
         shot = self.send("Page.captureScreenshot", format="png")["data"]
         return np.asarray(Image.open(io.BytesIO(base64.b64decode(shot))).convert("RGB"))
 
+    def press(self, key: str, code: int) -> None:
+        """Press and release a key, by its name and Windows' code."""
+        for kind in ("rawKeyDown", "keyUp"):
+            self.send("Input.dispatchKeyEvent", type=kind, key=key, code=key, windowsVirtualKeyCode=code)
+
     def drag(self, start: tuple[float, float], end: tuple[float, float]) -> None:
         """Press the left button at a point, move, and let go at another."""
         for kind, (x, y) in (("mousePressed", start), ("mouseMoved", end), ("mouseReleased", end)):

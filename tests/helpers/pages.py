@@ -1,10 +1,13 @@
 """Viewer pages opened in a browser."""
 
 import base64
+import json
+import re
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -35,6 +38,22 @@ def served(folder: Path) -> Iterator[str]:
     yield f"http://127.0.0.1:{server.server_port}"
     server.shutdown()
     server.server_close()
+
+
+def half_height(fields: Sequence[Sequence[float]], aspect: float) -> float:
+    """Twin of halfHeight in fit.js."""
+    wide, degrees = np.transpose(fields)
+    halves = np.log(np.tan(np.radians(degrees) / 2))
+    return float(np.exp(np.interp(np.log(aspect), np.log(wide), halves)))
+
+
+def opened(page: Path, camera: Camera) -> Camera:
+    """Return a view as near as the page opens at it."""
+    found = re.search(r'"fov": (\[\[.*?\]\])', page.read_text(encoding="utf-8"))
+    assert found
+    half = half_height(json.loads(found[1]), camera.width / camera.height)
+    focal = camera.height / 2 / half
+    return replace(camera, K=np.array([[focal, 0, camera.K[0, 2]], [0, focal, camera.K[1, 2]], [0, 0, 1]]))
 
 
 def show(browser: Browser, page: Path | str) -> None:

@@ -82,7 +82,7 @@ def test_the_bundle_is_the_one_its_readme_names() -> None:
 
 def test_a_page_holds_viewer_and_scene_and_names_no_address(tmp_path: Path) -> None:
     ball = checkered_ball(200)
-    start = Start((1.0, 2.0, 3.0), (0.0, 0.0, 0.5), (42.0, 30.0))
+    start = Start((1.0, 2.0, 3.0), (0.0, 0.0, 0.5), ((0.5, 42.0), (2.0, 30.0)))
     written, sizes = write_page(
         tmp_path / "a.html",
         [("a </script> & b", ball)],
@@ -96,8 +96,10 @@ def test_a_page_holds_viewer_and_scene_and_names_no_address(tmp_path: Path) -> N
     assert parts.labels == ["a </script> & b"]
     view = json.loads(parts.scripts["view"])
     assert view == {
-        "start": {"position": [1, 2, 3], "target": [0, 0, 0.5], "fov": [42, 30]},
-        "stops": [{"title": "worst", "position": [1, 2, 3], "target": [0, 0, 0.5], "fov": [42, 30]}],
+        "start": {"position": [1, 2, 3], "target": [0, 0, 0.5], "fov": [[0.5, 42], [2, 30]]},
+        "stops": [
+            {"title": "worst", "position": [1, 2, 3], "target": [0, 0, 0.5], "fov": [[0.5, 42], [2, 30]]}
+        ],
         "background": [1, 0.5, 0.25],
         "files": ["scene0.sog"],
         "antialiased": [False],
@@ -142,15 +144,15 @@ def test_failures_leave_no_half_written_page(tmp_path: Path, monkeypatch: pytest
 
 def in_viewer(points: np.ndarray, start: Start, width: int, height: int) -> np.ndarray:
     """Twin: (N, 2) pixels of points of a scene's file as the viewer shows them: turned by 180° about z, for
-    a camera with y up and no roll, its field of view along the longer side."""
+    a camera with y up and no roll, in a window of the view's shape."""
     world = points * [-1, -1, 1]
     eye, target = np.array(start.position), np.array(start.target)
     back = (eye - target) / np.linalg.norm(eye - target)
     right = np.cross([0, 1, 0], back)
     right /= np.linalg.norm(right)
     x, y, z = np.stack([right, np.cross(back, right), back]) @ (world - eye).T
-    focal = width / 2 / np.tan(np.radians(start.fov[0]) / 2)
-    assert focal == pytest.approx(height / 2 / np.tan(np.radians(start.fov[1]) / 2))
+    (vertical,) = (degrees for aspect, degrees in start.fov if np.isclose(aspect, width / height))
+    focal = height / 2 / np.tan(np.radians(vertical) / 2)
     return np.stack([width / 2 - focal * x / z, height / 2 + focal * y / z], 1)
 
 
@@ -166,7 +168,7 @@ def test_the_start_shows_what_the_view_shows(seed: int) -> None:
     )
     eye = offset + 3 * rng.normal(size=3)
     camera = Camera.facing(eye, offset, width=size[0], height=size[1], fov=50, up=up)
-    stand = frame_with(scene, Cameras.of([camera]), up=tuple(up))
+    stand = frame_with(scene, Cameras.of([camera]), up=tuple(up), start=camera.name)
     here = stand.of(scene)
     assert not here.offset.any()
     assert np.allclose(stand.up, up / np.linalg.norm(up))
@@ -301,5 +303,7 @@ def test_a_page_opens_with_the_whole_subject_in_sight(height: float) -> None:
     stand = frame_with(tall, None, up=(0, -1, 0))
     assert stand.start is not None
     eye, target = (stand.world(point) for point in (stand.start.position, stand.start.target))
-    opened = Camera.facing(eye, target, width=120, height=90, fov=stand.start.fov[0], up=(0, -1, 0))
+    _, vertical = stand.start.fov[-1]
+    across = 2 * np.degrees(np.arctan(np.tan(np.radians(vertical) / 2) * 120 / 90))
+    opened = Camera.facing(eye, target, width=120, height=90, fov=across, up=(0, -1, 0))
     assert opened.holds(tall.means).mean() >= 0.99

@@ -44,7 +44,7 @@ def compare(
     background: opt.BackgroundOption = None,
 ) -> None:
     """Compare renders of two scenes: PSNR, SSIM, the worst views, and a page to look at."""
-    from g2ard.jobs.comparison import dense_first
+    from g2ard.jobs.comparison import dense_first, made_of_points
     from g2ard.jobs.inputs import GivenViews, load_views
     from g2ard.jobs.run_views import at_size, is_planned, planned_at, views_or_pool
     from g2ard.jobs.view_checks import check_sight, opaque_points
@@ -119,7 +119,7 @@ def compare(
                 scenes,
                 start=stand.start,
                 stops=stops,
-                background=backdrop(known, [dense, other]),
+                background=backdrop(known, [dense, other], of_points=made_of_points(first)),
                 overwrite=run.overwrite,
                 progress=run.progress,
             )

@@ -86,14 +86,6 @@ def _dense_of(path: Path) -> Path | None:
     return dense if Source(dense).count <= _LARGEST_DENSE else None
 
 
-def _is_of_points(path: Path) -> bool:
-    """Return whether a scene is a run's result that was made of a point cloud, or its scene file."""
-    from g2ard.jobs.comparison import source_of
-
-    dense = source_of(path if path.is_dir() else path.parent)
-    return dense is not None and dense.exists() and Source(dense).kind == "points"
-
-
 def _write(
     run: Run,
     scene: Path,
@@ -107,7 +99,7 @@ def _write(
 ) -> None:
     """Write the page of one scene or two."""
     from g2ard.io import read_views
-    from g2ard.jobs.comparison import dense_first
+    from g2ard.jobs.comparison import dense_first, made_of_points
     from g2ard.jobs.inputs import GivenViews
     from g2ard.jobs.viewer_frame import backdrop, frame_of
     from g2ard.viewer.page import write_page
@@ -127,7 +119,7 @@ def _write(
         output,
         [(label, stand.of(splats)) for label, splats in zip(labels, loaded, strict=True)],
         start=stand.start,
-        background=None if known is None and _is_of_points(scene) else backdrop(known, loaded),
+        background=backdrop(known, loaded, of_points=made_of_points(scene)),
         overwrite=run.overwrite,
         progress=run.progress,
     )

@@ -1,0 +1,154 @@
+"""How much of a scene a page shows when it opens, in windows of any shape."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from g2ard.rendering.renderer import Renderer
+from g2ard.scene.cameras import Camera, Cameras
+from g2ard.scene.samples import evenly_spaced
+from g2ard.scene.splats import Splats
+
+Fields = tuple[tuple[float, float], ...]
+"""Vertical fields of view in degrees for windows of rising aspects, see `g2ard.viewer.page.Start`."""
+
+_EXTREMES = (0.1, 10.0)
+"""Aspects (width / height) beyond those of all windows."""
+
+_ASPECTS = (0.4, 0.5, 0.65, 0.8, 1.0, 1.25, 1.6, 2.0, 2.5)
+"""Aspects for which the surroundings of a photo are measured: from a phone upright to one on its side."""
+
+_SUBJECT, _MARGIN = 0.995, 1.1
+"""Share of the points in a view that its subject consists of, along each axis, and room around it."""
+
+_SIDE, _PHOTO_SIDE = 200, 64
+"""Pixels along a side of the picture of a photo's surroundings, and of the photos' depths."""
+
+_ROWS, _PHOTOS = 200_000, 64
+"""Gaussians and photos that are used, at most."""
+
+_WITNESSES, _TOLERANCE = 3, 0.1
+"""Photos that must see a surface for it to be known, and how far from their depths it may be, relative."""
+
+_UNSEEN, _FINEST, _STEPS = 0.05, 0.05, 60
+"""Share of a window that no photo need see, the least share of the view that is shown, and views between."""
+
+_EMPTY = 0.05
+"""Share of a photo without matter above which emptiness is what photos show."""
+
+
+def fields_of(
+    view: Camera,
+    *,
+    subject: NDArray[np.float64] | None = None,
+    scene: Splats | None = None,
+    photos: Cameras | None = None,
+) -> Fields:
+    """Return the fields of view with which a page opens at a view: all of it fits into the window.
+
+    Args:
+        subject: (N, 3) world points. The window holds most of those in the view, and no more.
+        scene: what is shown, for `photos`.
+        photos: views that scene was trained on, one of them `view`. Fields are narrowed until hardly anything
+            that photos did not see is in the window.
+
+    >>> view = Camera.facing([0, -1, 0], [0, 0, 0], width=40, height=30, fov=60)
+    >>> [(round(aspect, 2), round(degrees)) for aspect, degrees in fields_of(view)]
+    [(0.1, 160), (1.33, 47), (10.0, 47)]
+    """
+    across, down = _halves(view)
+    if subject is not None:
+        across, down = _extent(view, subject)
+    aspects = np.array(sorted({across / down, *(_EXTREMES if photos is None else _ASPECTS)}))
+    halves = np.maximum(down, across / aspects)
+    if photos is not None and scene is not None:
+        halves = _narrowed(halves, aspects, view, scene, photos)
+    return tuple(zip(aspects.tolist(), np.degrees(2 * np.arctan(halves)).tolist(), strict=True))
+
+
+def _halves(view: Camera) -> tuple[float, float]:
+    """Return half the width and height of a view at distance 1."""
+    return float(view.width / view.K[0, 0] / 2), float(view.height / view.K[1, 1] / 2)
+
+
+def _extent(view: Camera, points: NDArray[np.float64]) -> tuple[float, float]:
+    """Return half the width and height, at distance 1, around most of the points in a view."""
+    held = points[view.holds(points)]
+    if not len(held):
+        return _halves(view)
+    x, y, z = view.viewmat[:3, :3] @ (held - view.position).T
+    across, down = (
+        max(_FINEST * most, _MARGIN * float(np.quantile(np.abs(along / z), _SUBJECT)))
+        for along, most in zip((x, y), _halves(view), strict=True)
+    )
+    return across, down
+
+
+def _narrowed(
+    halves: NDArray[np.float64],
+    aspects: NDArray[np.float64],
+    view: Camera,
+    scene: Splats,
+    photos: Cameras,
+) -> NDArray[np.float64]:
+    """Return half heights of windows that show little else than what photos saw, at most the given ones."""
+    reach = float((halves * np.maximum(1, aspects)).max())
+    across, down, seen = _surroundings(view, scene, photos, reach)
+    narrowed = halves.copy()
+    for row, (half, aspect) in enumerate(zip(halves, aspects, strict=True)):
+        for narrowed[row] in np.geomspace(half, _FINEST * half, _STEPS):
+            window = (across <= aspect * narrowed[row]) & (down <= narrowed[row])
+            if np.mean(seen[window]) >= 1 - _UNSEEN:
+                break
+    return narrowed
+
+
+def _surroundings(
+    view: Camera, scene: Splats, photos: Cameras, reach: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
+    """Look beyond a photo's edges.
+
+    Returns:
+        |x|, |y| at distance 1 and whether photos saw it, of each pixel of a square picture whose sides are
+        2 · `reach` at distance 1.
+    """
+    focal, middle = _SIDE / (2 * reach), _SIDE / 2
+    K = np.array([[focal, 0, middle], [0, focal, middle], [0, 0, 1]])
+    renderer = Renderer(_thinned(scene))
+    drawn = renderer.render(Camera(view.viewmat, K, _SIDE, _SIDE), median=True)
+    assert drawn.median is not None
+    y, x = (np.mgrid[:_SIDE, :_SIDE].reshape(2, -1) + 0.5 - middle) / focal
+    depth = drawn.median.ravel().astype(np.float64)
+    surface = np.stack([x * depth, y * depth, depth], axis=1) @ view.viewmat[:3, :3] + view.position
+    witnesses = np.zeros(len(surface), np.int64)
+    some = photos.take(evenly_spaced(len(photos), _PHOTOS)).scaled(_PHOTO_SIDE)
+    for photo in some:
+        witnesses += _sees(renderer, photo, surface)
+    own = (np.abs(x) <= _halves(view)[0]) & (np.abs(y) <= _halves(view)[1])
+    empty = depth <= 0
+    known = witnesses >= min(_WITNESSES, len(some))
+    known[empty] = empty[own].mean() > _EMPTY
+    return np.abs(x), np.abs(y), known | own
+
+
+def _sees(renderer: Renderer, photo: Camera, points: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return which of the (N, 3) points are what a photo shows first."""
+    depths = renderer.render(photo, median=True).median
+    assert depths is not None
+    seen = photo.holds(points)
+    x, y, z = photo.viewmat[:3, :3] @ (points[seen] - photo.position).T
+    column = (photo.K[0, 0] * x / z + photo.K[0, 2]).astype(int).clip(0, photo.width - 1)
+    row = (photo.K[1, 1] * y / z + photo.K[1, 2]).astype(int).clip(0, photo.height - 1)
+    seen[seen] = np.abs(depths[row, column] - z) < _TOLERANCE * z
+    return seen
+
+
+def _thinned(scene: Splats) -> Splats:
+    """Return a sample of a large scene, its Gaussians widened so that surfaces stay closed."""
+    if len(scene) <= _ROWS:
+        return scene
+    some = scene.take(np.array(evenly_spaced(len(scene), _ROWS)))
+    return replace(some, scales=some.scales * np.float32(np.sqrt(len(scene) / _ROWS)))
