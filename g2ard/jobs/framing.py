@@ -45,15 +45,15 @@ def fields_of(
     *,
     subject: NDArray[np.float64] | None = None,
     scene: Splats | None = None,
-    photos: Cameras | None = None,
+    cameras: Cameras | None = None,
 ) -> Fields:
     """Return the fields of view with which a page opens at a view: all of it fits into the window.
 
     Args:
         subject: (N, 3) world points. The window holds most of those in the view, and no more.
-        scene: what is shown, for `photos`.
-        photos: views that scene was trained on, one of them `view`. Fields are narrowed until hardly anything
-            that photos did not see is in the window.
+        scene: what is shown, for `cameras`.
+        cameras: views that scene was trained on, one of them `view`. Fields are narrowed until the window
+            shows hardly anything that photos did not see.
 
     >>> view = Camera.facing([0, -1, 0], [0, 0, 0], width=40, height=30, fov=60)
     >>> [(round(aspect, 2), round(degrees)) for aspect, degrees in fields_of(view)]
@@ -62,10 +62,10 @@ def fields_of(
     across, down = _halves(view)
     if subject is not None:
         across, down = _extent(view, subject)
-    aspects = np.array(sorted({across / down, *(_EXTREMES if photos is None else _ASPECTS)}))
+    aspects = np.array(sorted({across / down, *(_EXTREMES if cameras is None else _ASPECTS)}))
     halves = np.maximum(down, across / aspects)
-    if photos is not None and scene is not None:
-        halves = _narrowed(halves, aspects, view, scene, photos)
+    if cameras is not None and scene is not None:
+        halves = _narrowed(halves, aspects, view, scene, cameras)
     return tuple(zip(aspects.tolist(), np.degrees(2 * np.arctan(halves)).tolist(), strict=True))
 
 
@@ -92,11 +92,11 @@ def _narrowed(
     aspects: NDArray[np.float64],
     view: Camera,
     scene: Splats,
-    photos: Cameras,
+    cameras: Cameras,
 ) -> NDArray[np.float64]:
     """Return half heights of windows that show little else than what photos saw, at most the given ones."""
     reach = float((halves * np.maximum(1, aspects)).max())
-    across, down, seen = _surroundings(view, scene, photos, reach)
+    across, down, seen = _surroundings(view, scene, cameras, reach)
     narrowed = halves.copy()
     for row, (half, aspect) in enumerate(zip(halves, aspects, strict=True)):
         for narrowed[row] in np.geomspace(half, _FINEST * half, _STEPS):
@@ -107,7 +107,7 @@ def _narrowed(
 
 
 def _surroundings(
-    view: Camera, scene: Splats, photos: Cameras, reach: float
+    view: Camera, scene: Splats, cameras: Cameras, reach: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
     """Look beyond a photo's edges.
 
@@ -124,7 +124,7 @@ def _surroundings(
     depth = drawn.median.ravel().astype(np.float64)
     surface = np.stack([x * depth, y * depth, depth], axis=1) @ view.viewmat[:3, :3] + view.position
     witnesses = np.zeros(len(surface), np.int64)
-    some = photos.take(evenly_spaced(len(photos), _PHOTOS)).scaled(_PHOTO_SIDE)
+    some = cameras.take(evenly_spaced(len(cameras), _PHOTOS)).scaled(_PHOTO_SIDE)
     for photo in some:
         witnesses += _sees(renderer, photo, surface)
     own = (np.abs(x) <= _halves(view)[0]) & (np.abs(y) <= _halves(view)[1])

@@ -140,7 +140,7 @@ def frame_with(
     view = best[best.names.index(start) if start else 0]
     stand, points = ViewerFrame(_turn(axis), _middle(scene)), opaque_points(scene)
     photos = cameras if cameras is not None and any(cameras.image_paths) else None
-    fields = fields_of(view, subject=None if start else points, scene=scene, photos=photos)
+    fields = fields_of(view, subject=None if start else points, scene=scene, cameras=photos)
     return replace(stand, start=stand.start_at(view, points, fields), name=view.name)
 
 

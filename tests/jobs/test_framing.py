@@ -55,7 +55,7 @@ def test_all_of_a_view_fits_into_the_window(aspect: float) -> None:
 @pytest.mark.parametrize("aspect", ASPECTS)
 def test_what_no_photo_saw_is_outside(aspect: float) -> None:
     views, scene = photos(), wall(-4, 4, -4, 4)
-    tall = half(fields_of(views[2], scene=scene, photos=views), aspect)
+    tall = half(fields_of(views[2], scene=scene, cameras=views), aspect)
     whole = half(fields_of(views[2]), aspect)
     seen = min(1, 0.42 / (tall * aspect)) * min(1, 0.8 / tall)
     assert seen > 0.9
@@ -66,12 +66,12 @@ def test_what_no_photo_saw_is_outside(aspect: float) -> None:
 @pytest.mark.parametrize("aspect", ASPECTS[1:])  # a phone shows more above and below than any photo
 def test_what_other_photos_saw_may_be_shown(aspect: float) -> None:
     views = photos(0.1 * np.arange(-40, 41))
-    fields = fields_of(views[40], scene=wall(-4, 4), photos=views)
+    fields = fields_of(views[40], scene=wall(-4, 4), cameras=views)
     assert half(fields, aspect) == pytest.approx(half(fields_of(views[40]), aspect), rel=0.01)
 
 
 @pytest.mark.parametrize("aspect", ASPECTS)
 def test_photos_of_an_object_before_nothing_keep_what_is_empty(aspect: float) -> None:
     views, scene = photos(), wall(-0.2, 0.2, -0.4, 0.4)
-    fields = fields_of(views[2], scene=scene, photos=views)
+    fields = fields_of(views[2], scene=scene, cameras=views)
     assert half(fields, aspect) == pytest.approx(half(fields_of(views[2]), aspect), rel=0.01)
