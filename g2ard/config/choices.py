@@ -59,7 +59,7 @@ Alpha = Literal["composite", "mask"]
 """Treatment of transparent pixels of photos (`g2ard.io.types.ViewFiles`)."""
 
 PointColor = Literal["intensity", "class"]
-"""What colours points instead of their own colours (`g2ard.jobs.chosen_points`)."""
+"""Columns that colour points instead of their own colours (`g2ard.jobs.chosen_points`)."""
 
 Convention = Literal["gsplat", "inria"]
 """Rasteriser conventions that renderers disagree on (`g2ard.rendering.renderer`)."""

@@ -35,7 +35,7 @@ _COLUMNS: dict[PointColor, tuple[str, ...]] = {
     "intensity": ("intensity", "reflectance", "reflectivity"),
     "class": ("classification", "class"),
 }
-"""What colours points → names of its column."""
+"""`PointColor` → names of its column."""
 
 _Ranges = dict[str, tuple[float, float]]
 
@@ -93,7 +93,7 @@ class PointChoice(Settings):
         source.through = partial(self.of, progress=progress)
 
     def of(self, stream: PointStream, progress: Progress = silent) -> PointStream:
-        """Return the chosen points of a cloud; raise an `InputError` if there are none."""
+        """Return the chosen points of a cloud; raise an `InputError` if it has none."""
         ranges: _Ranges = {}
         found = self._narrowed(stream, progress, ranges)
         if found is None:

@@ -1,4 +1,4 @@
-"""How much of a scene a page shows when it opens, in windows of any shape."""
+"""Fields of view with which pages open, in windows of any shape."""
 
 from __future__ import annotations
 

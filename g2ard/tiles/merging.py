@@ -173,7 +173,7 @@ def _reduced(
     final: Sequence[int],
     inputs: list[dict[str, Any]] | None = None,
 ) -> list[Path]:
-    """Reduce every tile by itself to its count; return the results of `reduce`."""
+    """Reduce each tile alone to its count; return the results of `reduce`."""
     method = asdict(run.method)
     given = [{"method": method, "count": n, "final": end} for n, end in zip(counts, final, strict=True)]
     return run.each("reduce", "reduce", per_tile=given, inputs=inputs)

@@ -13,7 +13,7 @@ from helpers.commands import CommandLine, succeeds
 
 KERNELS = ("Trainer", "VisibilityAccumulator", "TileMerging", "accumulate", "accumulate_each")
 KERNELS += ("cast_rays", "simplify_flags", "simplify_paper", "simplify_pairwise")
-"""What measures coverage, plans poses, merges or trains."""
+"""Kernels that measure coverage, plan poses, merge or train."""
 
 FEW = 15
 """Images of 160 pixels that tell whether photos show the scene."""

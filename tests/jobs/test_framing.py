@@ -1,4 +1,4 @@
-"""How much of a scene pages show when they open, by the shape of the window."""
+"""Tests of the fields of view with which pages open, by the shape of the window."""
 
 from dataclasses import replace
 from pathlib import Path
