@@ -93,7 +93,7 @@ class PointChoice(Settings):
         source.through = partial(self.of, progress=progress)
 
     def of(self, stream: PointStream, progress: Progress = silent) -> PointStream:
-        """Return the chosen points of a cloud; raise an `InputError` if it has none."""
+        """Return the chosen points of a cloud; raise an `InputError` if nothing is chosen."""
         ranges: _Ranges = {}
         found = self._narrowed(stream, progress, ranges)
         if found is None:
