@@ -137,7 +137,7 @@ def _wrong(name: str, parameter: str, annotation: str) -> Iterator[Any]:
 def _cases() -> Iterator[tuple[str, str]]:
     for name in VALID:
         for parameter in inspect.signature(getattr(g2ard, name)).parameters.values():
-            called = parameter.name in ("progress", "say", "watch", "time_left")
+            called = parameter.name in ("progress", "say", "watch", "time_left", "runs")
             if not called and parameter.kind != parameter.VAR_KEYWORD:
                 yield name, parameter.name
 

@@ -65,7 +65,7 @@ class Source:
         Memory holds one block of a .ply, .compressed.ply or .splat, one chunk of a SOG, one tile, or the
         whole file of other formats.
         """
-        stream: SceneStream = self._opened("splats")
+        stream: SceneStream = self._joined("splats") if self.others else self._opened("splats")
         stream.render_model = self.render_model or stream.render_model
         return stream
 
@@ -77,7 +77,7 @@ class Source:
 
     @cached_property
     def _points(self) -> PointStream:
-        stream: PointStream = self._opened("points")
+        stream: PointStream = self._joined("points") if self.others else self._opened("points")
         return self.through(stream) if self.through else stream
 
     def cloud(self, *, bare: bool = False) -> PointStream:
@@ -129,13 +129,18 @@ class Source:
         """Raise an `InputError` for anything but a scene."""
         reader(self.file, self.format, "splats")
 
+    def _joined(self, expected: Kind) -> Any:
+        """Open this one and the others as one stream."""
+        reader(self.file, self.format, expected)
+        first = Source(self.path, self.render_model)
+        first.__dict__["format"] = self.format  # it is detected once
+        return joined([first, *self.others])
+
     @explained
     def _opened(self, expected: Kind) -> Any:
         from g2ard.io.stream import PartsStream
 
         module = reader(self.file, self.format, expected)
-        if self.others:
-            return joined([Source(self.path, self.render_model), *self.others])
         with about(self.file):
             if hasattr(module, "Stream"):
                 return module.Stream(self.file)

@@ -91,9 +91,15 @@ def source_of(path: Path) -> Path | None:
     return None if scene is None else real_path(Path(scene))
 
 
-def made_of_points(path: Path) -> bool:
-    """Return whether a scene is a point cloud, or was made of one: a run's result, or its scene file."""
-    dense = source_of(path if path.is_dir() else path.parent) or path
+def made_of_points(path: Path, opened: Source | None = None) -> bool:
+    """Return whether a scene is a point cloud, or was made of one: a run's result, or its scene file.
+
+    Args:
+        opened: the source of `path`, if there is one.
+    """
+    dense = source_of(path if path.is_dir() else path.parent)
+    if dense is None:
+        return path.exists() and (opened or Source(path)).kind == "points"
     return dense.exists() and Source(dense).kind == "points"
 
 

@@ -412,6 +412,7 @@ def write_level_page(
     given: GivenViews,
     *,
     background: Colour | None = None,
+    source: Source | None = None,
 ) -> int:
     """Write the page that shows the levels in a folder, and return its bytes.
 
@@ -420,12 +421,13 @@ def write_level_page(
         kind: streamed SOG, or 3D Tiles with z up.
         given: see `g2ard.jobs.viewer_frame.frame_of`. The page's title names the scene, or else the folder.
         background: see `g2ard.jobs.viewer_frame.backdrop`.
+        source: the source of the scene beside `given`, if it is open.
     """
     coarse = levels[-1]
     few = coarse.take(np.array(evenly_spaced(len(coarse), _ROWS, floor=True)))
     frame = frame_of(few, given)
     finest = levels[0].take(np.array(evenly_spaced(len(levels[0]), _ROWS, floor=True)))
-    of_points = given.beside is not None and made_of_points(Path(given.beside))
+    of_points = given.beside is not None and made_of_points(Path(given.beside), source)
     behind = backdrop(background, [finest], of_points=of_points)
     page, offset = folder / "index.html", np.asarray(few.offset)
     title = names_of([Path(given.beside or folder)])[0]

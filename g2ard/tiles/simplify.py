@@ -179,7 +179,7 @@ def _add_until_converged(
         views = range(first, len(cameras), stride)
         sums.add([view_of(cameras, i, settings) for i in views], settings, None)
         used += views
-        tell_share(len(used) / len(cameras))
+        tell_share(len(used) / max(1, len(cameras)))
         before, seen = seen, int(np.count_nonzero(sums.by_row()[0][:rows]))
         if len(used) > ROUND and seen - before < CONVERGED * rows:
             break

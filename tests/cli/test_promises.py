@@ -269,6 +269,7 @@ APART = {
     r"by default (?!\d|128)|default options|estimated by default|all by default": "names no value",
     r"\(default\)": "the background of tests/cli/test_every_option.py",
     r"in \.NAME\.tiles": "tests/cli/test_resume.py",
+    r"classification == 2": "tests/jobs/test_chosen_points.py",
     r"\.mp4 \(needs ffmpeg\)": "tests/test_documented_commands.py",
     r"\.e57": "tests/io/test_e57.py",
     r"page:10MB|one view as \.png": "tests/cli/test_pages.py and tests/cli/test_pictures.py",

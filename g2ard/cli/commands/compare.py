@@ -119,7 +119,7 @@ def compare(
                 scenes,
                 start=stand.start,
                 stops=stops,
-                background=backdrop(known, [dense, other], of_points=made_of_points(first)),
+                background=backdrop(known, [dense, other], of_points=made_of_points(first, sources[0])),
                 overwrite=run.overwrite,
                 progress=run.progress,
             )

@@ -230,7 +230,9 @@ def lod(
         run.kept.append(f"{output} is written")
         frame = GivenViews(views, scene, axis)
         with run.showing("the page"):
-            written += write_level_page(output, levels.splats, kind, frame, background=background)
+            written += write_level_page(
+                output, levels.splats, kind, frame, background=background, source=source
+            )
             query = "" if kind == "sog" else "/?cesium=URL (a folder of CesiumJS)"
             run.say(f"page: python -m http.server --directory {output}, then http://localhost:8000{query}")
         peak = {"peak_rss_bytes": peak_rss_of_all()} if tiled else {}

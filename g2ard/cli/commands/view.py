@@ -114,12 +114,13 @@ def _write(
     stand = frame_of(loaded[0], GivenViews(views, sources[0].file, up), start=start, say=run.say)
     labels = labels_of(sources, [len(splats) for splats in loaded], roles)
     known = opt.background_of(run, background, scene, other)
+    opened = sources[shown.index(scene)]
     run.begin("page")
     written, scene_sizes = write_page(
         output,
         [(label, stand.of(splats)) for label, splats in zip(labels, loaded, strict=True)],
         start=stand.start,
-        background=backdrop(known, loaded, of_points=made_of_points(scene)),
+        background=backdrop(known, loaded, of_points=made_of_points(scene, opened)),
         overwrite=run.overwrite,
         progress=run.progress,
     )
