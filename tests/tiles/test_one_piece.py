@@ -201,6 +201,8 @@ def test_runs_have_the_same_parts(name: str, inputs: Path, command_line: Command
     shown = shown if name != "cloud" else g2ard.lift(*vars(g2ard.load_points(folder / "cloud.ply")).values())
     bare = replace(views.cameras, image_paths=())
     targets = TeacherRenders(shown, bare.take([i for i, split in enumerate(views.splits) if split == "test"]))
+    least: list[float] = []
     for file in ("simplified/scene.ply", "scene.ply"):
         scores = [g2ard.evaluate(g2ard.load(folder / way / file), targets).psnr for way in WAYS]
-        assert scores[1] > scores[0] - _LOST_BY_FEW, scores
+        least.append(scores[0])  # so few steps gain, or the guard takes them back
+        assert scores[1] > min(least) - _LOST_BY_FEW, scores
