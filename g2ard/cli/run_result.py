@@ -38,10 +38,10 @@ def tell_run(
         source: what was distilled.
         page: line about the page.
     """
-    from g2ard.report.run import COLUMNS, rows_of
+    from g2ard.report.run import COLUMNS, rows_of, sizes_of
 
     run.say(counts_line(report))
-    title = f"held-out views against {report.against}, {report.size}, {report.stages}:"
+    title = f"held-out views against {report.against}, {sizes_of(report)}, {report.stages}:"
     run.console.table(title, list(COLUMNS), rows_of(report))
     for line in told(report, verbose=run.verbose):
         run.say(line)

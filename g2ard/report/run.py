@@ -124,16 +124,23 @@ def rows_of(report: RunReport) -> list[list[str]]:
     if report.own_size is None:
         return cells(report.kinds)
     before, after = (report.own_size[name] for name in ("simplified", "recovered"))
-    views, size = after.scored_in.split()[0], after.scored_in.rpartition(", ")[2]
     first = [
-        f"full size, {size}",
-        views,
+        "full size",
+        after.scored_in.split()[0],
         f"{before.psnr:.2f} → {after.psnr:.2f}",
         "–",
         "–" if math.isnan(after.detail) else f"{before.detail:.2f} → {after.detail:.2f}",
         f"{before.ssim:.4f} → {after.ssim:.4f}",
     ]
     return [first, *cells(report.kinds)]
+
+
+def sizes_of(report: RunReport) -> str:
+    """Return the size of a run's held-out views, and their own if another one was requested."""
+    if report.own_size is None:
+        return report.size
+    full = report.own_size["recovered"].scored_in.rpartition(", ")[2]
+    return f"{report.size} (full size: {full})"
 
 
 @dataclass(frozen=True)

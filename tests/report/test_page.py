@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from g2ard.report.distilled import _worst, verdict
-from g2ard.report.run import RunReport, by_kind, rows_of
+from g2ard.report.run import RunReport, by_kind, rows_of, sizes_of
 from g2ard.stages.evaluate import Means, ViewScore
 from helpers.commands import CommandLine, succeeds
 from helpers.studies import check_page, study
@@ -58,6 +58,7 @@ def test_the_verdict_names_the_weakest_kind_of_view() -> None:
     assert "at 26.0 dB in 5 photos, 96×72 px, the views' own size; at 29.8 dB, the mean of 5" in told
     sizes = {"simplified": replace(full, psnr=24.5), "recovered": full}
     first, *others = rows_of(replace(report, own_size=sizes))
-    assert first[:3] == ["full size, 96×72 px", "5", "24.50 → 26.04"]
+    assert first[:3] == ["full size", "5", "24.50 → 26.04"]
+    assert sizes_of(replace(report, own_size=sizes)) == f"{report.size} (full size: 96×72 px)"
     assert others == rows_of(report)
     assert rows_of(report)[0][0] == "usual"

@@ -91,8 +91,11 @@ def test_levels_have_exact_counts_and_a_stopped_chain_goes_on(place: Path, tmp_p
     whole = levels_in_tiles(place, tmp_path / "whole")
     assert [len(level) for level in whole.splats] == [3000, 1000, 250]
     assert [isinstance(level, TileStore) for level in whole.splats] == [True, False, False]
-    for report in whole.reports[1:]:
-        assert report.recovered > report.simplified > 15
+    many, few = whole.reports[1:]
+    assert many.recovered > many.simplified > 25
+    # So few Gaussians gain .3 dB or lose .2, as their merges depend on the processor's rounding.
+    assert min(few.recovered, few.simplified) > 20
+    assert abs(few.recovered - few.simplified) < 1
 
     class StopError(Exception):
         pass
