@@ -44,6 +44,7 @@ from g2ard.viewer.page import write_page
 if TYPE_CHECKING:
     from g2ard.jobs.distill import DistillJob, RunTargets
     from g2ard.pipeline.distill import Distilled
+    from g2ard.report.distilled import Drawn
     from g2ard.report.run import RunReport
 
 _WORK_FOLDER = ".unfinished"
@@ -183,7 +184,7 @@ class RunFolder:
         write_views(self._scored, scored, splits=["test"] * len(scored), overwrite=True)
 
     def write_pages(
-        self, source: Source | Path, job: Any, done: Any, report: RunReport, told: Sequence[str]
+        self, source: Source | Path, job: Any, done: Any, report: RunReport, told: Sequence[str], drawn: Drawn
     ) -> tuple[RunReport, str]:
         """Write preview.png, with --page view.html, and report.html; return the report with the size of that
         page, and a line about it.
@@ -191,27 +192,23 @@ class RunFolder:
         Args:
             source: what was distilled.
             told: the summary that the command prints.
+            drawn: the views to show, and pictures of them.
         """
         from g2ard.report.distilled import distill_report, pictures, preview, renderers_of
 
         title = f"{names_of([Path(str(source))])[0]}: {report.title}"
         scenes = [] if report.photos else [("simplified", done.simplified)]  # a start of photos is a blur
         scenes.append((RESULT, done.splats))
-        targets = list(filter(None, (done.held_out, job.targets.apart)))
         recover, page = job.config.recover, self.path / "report.html"
-        renderers, best, drawn = renderers_of(scenes, recover.background), None, []
-        with self._run.showing("choosing views for report.html"):
-            best = job.best(done)
-            fill(best, self._run.progress)
-        if best is None:
-            return report, ""
+        renderers, best, shown = renderers_of(scenes, recover.background), drawn.best, []
         with self._run.showing(_PICTURE):
+            fill(best, self._run.progress)
             on_white = None
             if job.renders and self._backdrop(recover.background, job.prior) is None:
                 on_white = partial(job.dense.images, background=WHITE)
             rows = range(len(best.cameras))
-            drawn = [pictures(best, row, list(renderers.values()), on_white) for row in rows]
-            preview(self.path / _PICTURE, drawn, scenes)
+            shown = [pictures(best, row, renderers, on_white, drawn) for row in rows]
+            preview(self.path / _PICTURE, shown, scenes)
         line = ""
         if self._run.config["page"]:
             dense, config = None, self._run.config
@@ -228,8 +225,8 @@ class RunFolder:
             files = {self.scene.name: self.scene.name, "view in the browser": self._view.name, "folder": "."}
             files = {text: name for text, name in files.items() if (self.path / name).exists()}
             command = shlex.join(["g2ard", *sys.argv[1:]])
-            shown: Any = {"best": drawn[0], "on_white": on_white, "command": command, "files": files}
-            distill_report(page, title, renderers, targets, report, told, **shown)
+            more: Any = {"best": shown[0], "on_white": on_white, "command": command, "files": files}
+            distill_report(page, title, renderers, drawn, report, told, **more)
         return report, line
 
     def write_report(self, report: Report) -> None:

@@ -51,6 +51,8 @@ from g2ard.progress import Detail, Progress, Say, plural, silent, unsaid
 from g2ard.rendering.metrics import psnr
 from g2ard.rendering.targets import Subset, Targets, fill, kinds_of, kinds_told, scored_in
 from g2ard.rendering.visibility import overdraw
+from g2ard.report.distilled import Drawn
+from g2ard.report.labels import RESULT
 from g2ard.report.run import Packed, RunReport, by_kind
 from g2ard.scene.cameras import USUAL, Cameras
 from g2ard.scene.samples import evenly_spaced
@@ -300,18 +302,24 @@ class DistillJob:
         drawn = scene.images(on.cameras, background)
         return float(np.mean([psnr(drawn[view], on[view]) for view in range(len(on.cameras))]))
 
-    def report(self, done: Distilled, file: Path) -> RunReport:
+    def report(self, done: Distilled, file: Path, drawn: Drawn | None = None) -> RunReport:
         """Score the simplified and the recovered scene in held-out views, and describe the run.
 
         Args:
             file: the written result; its scores are those of the file read back if it is packed.
+            drawn: keeps the pictures that the page shows.
         """
         scenes = {"simplified": done.simplified, "recovered": done.splats}
         from_points, background = self.config.recover.from_points, self.config.recover.background
         score = partial(evaluate, background=background, progress=self.progress)
 
         def scored(targets: Targets) -> dict[str, Evaluation]:
-            return {name: score(splats, targets, stage=f"score {name}") for name, splats in scenes.items()}
+            def score_one(name: str, label: str) -> Evaluation:
+                watch = None if drawn is None else partial(drawn.keep, label, targets)
+                return score(scenes[name], targets, stage=f"score {name}", watch=watch)
+
+            after = score_one("recovered", RESULT)
+            return {"simplified": score_one("simplified", "simplified"), "recovered": after}
 
         held_out, targets = done.scored_on(self.targets.held_out), self.targets
         cameras = held_out.cameras

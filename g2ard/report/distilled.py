@@ -23,7 +23,7 @@ from g2ard.report.labels import DENSE, RESULT, TARGET, labels_of
 from g2ard.report.page import Page, Shown
 from g2ard.report.run import COLUMNS, LOST, KindScore, RunReport, rows_of
 from g2ard.report.sheet import contact_sheet
-from g2ard.scene.cameras import Cameras, rows_by_kind
+from g2ard.scene.cameras import Camera, Cameras, rows_by_kind
 from g2ard.scene.splats import Splats
 from g2ard.stages.evaluate import ViewScore
 
@@ -47,24 +47,82 @@ Lit = Callable[[Cameras], Targets]
 """Function that draws the dense scene on white."""
 
 
+class Drawn:
+    """Pictures that a report shows, kept while their views are scored, so that none is rendered again.
+
+    Args:
+        best: the views that show most of the scene.
+        parts: scored targets, whose worst views are shown.
+    """
+
+    def __init__(self, best: Targets, parts: Sequence[Targets]) -> None:
+        self.best, self.parts = best, parts
+        self._shown = set(map(_key, best.cameras))
+        self._scored = {_key(view): view.kind for part in parts for view in part.cameras}
+        self._worst: dict[str, list[tuple[float, _Key]]] = {kind: [] for kind in self._scored.values()}
+        self._kept: dict[_Key, dict[str, tuple[NDArray[np.uint8], float]]] = {}
+
+    def keep(
+        self, scene: str, targets: Targets, view: int, score: ViewScore, image: NDArray[np.float32]
+    ) -> None:
+        """Keep a scene's picture and PSNR if the report may show the view; the result is scored first."""
+        key = _key(targets.cameras[view])
+        wanted = key in self._shown or key in self._kept
+        if scene == RESULT and key in self._scored:
+            worst, most = self._worst[score.kind], math.ceil(_SHOWN / len(self._worst))
+            worst.append((score.psnr, key))
+            worst.sort(key=lambda one: one[0])
+            gone = {other for _, other in worst[most:]} - self._shown
+            del worst[most:]
+            self._kept = {other: kept for other, kept in self._kept.items() if other not in gone}
+            wanted = key not in gone
+        if wanted:
+            self._kept.setdefault(key, {})[scene] = to_bytes(scored(image, targets, view)), score.psnr
+
+    def of(self, targets: Targets, view: int) -> Mapping[str, tuple[NDArray[np.uint8], float]]:
+        """Return the picture and PSNR of each scene that is kept of a view."""
+        return self._kept.get(_key(targets.cameras[view]), {})
+
+
+_Key = tuple[bytes, bytes, int, int]
+
+
+def _key(view: Camera) -> _Key:
+    """Return what a render depends on; views of other kinds may have the name of a given one."""
+    return view.viewmat.tobytes(), view.K.tobytes(), view.width, view.height
+
+
 def pictures(
-    targets: Targets, view: int, renderers: Sequence[Renderer], on_white: Lit | None = None
+    targets: Targets,
+    view: int,
+    renderers: Mapping[str, Renderer],
+    on_white: Lit | None = None,
+    drawn: Drawn | None = None,
 ) -> Pictures:
     """Render a view of targets.
 
     Args:
+        renderers: of the scenes by name.
         on_white: of a dense scene that has holes, behind which pictures show the sky; they are scored on
             black. None leaves the background.
+        drawn: pictures that need no render.
     """
     mask, target = mask_of(targets, view), targets[view]
-    renders = [rendered(renderer, targets, view) for renderer in renderers]
-    psnrs = [psnr(image, target, mask) for image in renders]
+    known = {} if drawn is None else drawn.of(targets, view)
+
+    def shown_of(name: str) -> tuple[NDArray[np.uint8], float]:
+        if name in known:
+            return known[name]
+        image = rendered(renderers[name], targets, view)
+        return to_bytes(scored(image, targets, view)), psnr(image, target, mask)
+
+    shown, psnrs = map(list, zip(*map(shown_of, renderers), strict=True))
     if on_white is not None:
         camera = targets.cameras[view]
         light = (on_white(targets.cameras.take([view]))[0] - target).mean(axis=2)
         target = over_sky(target, np.clip(light, 0, 1))
-        renders = [seen_on_sky(renderer.render(camera)) for renderer in renderers]
-    shown = [to_bytes(scored(image, targets, view)) for image in renders]
+        renders = [seen_on_sky(renderer.render(camera)) for renderer in renderers.values()]
+        shown = [to_bytes(scored(image, targets, view)) for image in renders]
     return Pictures(targets.cameras.names[view], to_bytes(scored(target, targets, view)), shown, psnrs)
 
 
@@ -77,7 +135,7 @@ def distill_report(
     path: Path,
     title: str,
     renderers: Mapping[str, Renderer],
-    targets: Sequence[Targets],
+    drawn: Drawn,
     report: RunReport,
     told: Sequence[str] = (),
     *,
@@ -91,7 +149,7 @@ def distill_report(
 
     Args:
         renderers: of the scenes in pictures by name, the result last.
-        targets: photos or teacher renders of the held-out views, and of the views of other kinds, if any.
+        drawn: its parts are the targets of the held-out views, and of the views of other kinds, if any.
         told: summary lines that the command prints.
         best: a view that shows most of the scene.
         on_white: see `pictures`.
@@ -101,17 +159,17 @@ def distill_report(
     page = Page(title, verdict(report))
     if files:
         page.links(files, f"{report.sizes}: ")
-    views = [(part, row) for part in targets for row in range(len(part.cameras))]
+    views = [(part, row) for part in drawn.parts for row in range(len(part.cameras))]
     parts = [part for part in (report.scores, report.apart) if part]
     scores = {name: [view for part in parts for view in part[name].views] for name in report.scores}
     before, after = scores["simplified"], scores["recovered"]
     scores[RESULT] = after
 
-    def show(drawn: Pictures) -> None:
-        named = zip(renderers, drawn.images, drawn.psnrs, strict=True)
+    def show(view: Pictures) -> None:
+        named = zip(renderers, view.images, view.psnrs, strict=True)
         shown = [Shown(stage, image, f"{score:.2f} dB") for stage, image, score in named]
-        height, width = drawn.target.shape[:2]
-        page.comparison(f"{drawn.name}, {width}×{height} px", drawn.target, shown[::-1])
+        height, width = view.target.shape[:2]
+        page.comparison(f"{view.name}, {width}×{height} px", view.target, shown[::-1])
 
     source = "a photo" if report.photos else f"a photo or a render of the {DENSE}"
     if "photo" not in report.against:
@@ -138,7 +196,7 @@ def distill_report(
     if worst:
         page.heading("Worst views")
     for view in worst:
-        show(pictures(*views[view], list(renderers.values()), on_white))
+        show(pictures(*views[view], renderers, on_white, drawn))
     page.paragraph(
         f"Made in {report.seconds['total']:,.0f} s. Scored against {report.against} in views that were not "
         f"trained on, which blend {report.overdraw:.1f} Gaussians per pixel."

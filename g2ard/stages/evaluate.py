@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from g2ard.config.checks import checks_arguments
 from g2ard.config.choices import BLACK, Colour
@@ -145,6 +146,7 @@ def evaluate(
     eight_bit: bool = False,
     progress: Progress = silent,
     stage: str = "evaluate",
+    watch: Callable[[int, ViewScore, NDArray[np.float32]], None] | None = None,
 ) -> Evaluation:
     """Render every view of `targets` and score it.
 
@@ -166,6 +168,7 @@ def evaluate(
         eight_bit: round renders and targets to multiples of 1/255, as in evaluations from saved PNGs.
         progress: called after each view.
         stage: stage name for progress.
+        watch: called with each view's row, score and render.
 
     Returns:
         One `ViewScore` per view, and their means.
@@ -187,7 +190,7 @@ def evaluate(
     fill(targets, progress)
     renderer = Renderer(splats, background=background, settings=settings)
 
-    def score(view: int) -> ViewScore:
+    def score(view: int) -> tuple[ViewScore, NDArray[np.float32] | None]:
         name = cameras.names[view]
         image, target = rendered(renderer, targets, view), targets[view]
         if eight_bit:
@@ -196,7 +199,7 @@ def evaluate(
         mask = mask_of(targets, view)
         if mask is not None and not mask.any():
             raise InputError(f"({name}) has no valid pixel", index=view, item="view")
-        return ViewScore(
+        found = ViewScore(
             name,
             psnr(image, target, mask),
             ssim(image, target, mask),
@@ -208,10 +211,13 @@ def evaluate(
             (int(cameras.widths[view]), int(cameras.heights[view])),
             lost_detail(image, target, mask),
         )
+        return found, None if watch is None else image
 
     scores: list[ViewScore] = []
     progress(stage, 0, len(cameras))
-    for done in in_threads(score, range(len(cameras))):
+    for view, (done, image) in enumerate(in_threads(score, range(len(cameras)))):
         scores.append(done)
+        if watch is not None and image is not None:
+            watch(view, done, image)
         progress(stage, len(scores), len(cameras))
     return Evaluation(len(splats), splats.nbytes, tuple(scores), scored_in(targets))

@@ -89,7 +89,7 @@ def test_the_preview_has_the_scores_of_the_table_and_greys_what_is_not_scored(
     monkeypatch.setattr(targets, "mask", lambda view: mask, raising=False)
     half = ball.take(range(100))
     scenes = [("half", half)]
-    renderers = list(distilled.renderers_of(scenes).values())
+    renderers = distilled.renderers_of(scenes)
     drawn = [distilled.pictures(targets, view, renderers) for view in range(2)]
     distilled.preview(tmp_path / "preview.png", drawn, scenes)
     rows, captions = shown

@@ -100,6 +100,7 @@ def distill(
     from g2ard.jobs.distill_options import DistillOptions
     from g2ard.jobs.tile_options import is_tiled
     from g2ard.pipeline.config import DistillConfig
+    from g2ard.report.distilled import Drawn
 
     settings, _ = run.settled(DistillConfig(), preset)
     budget = budget_of(run, optional=scene is None)
@@ -152,9 +153,13 @@ def distill(
         with folder.held(job):
             done: Any = job.run(folder.unfinished)
             folder.write(done, job.views, job.targets)
+            drawn, line = None, ""
+            with run.showing("choosing views for report.html"):
+                drawn = Drawn(job.best(done), list(filter(None, (done.held_out, job.targets.apart))))
             with run.finishing("scoring"):
-                report: Any = job.report(done, folder.scene)
-            report, line = folder.write_pages(source or name, job, done, report, told(report))
+                report: Any = job.report(done, folder.scene, drawn)
+            if drawn is not None:
+                report, line = folder.write_pages(source or name, job, done, report, told(report), drawn)
             folder.write_report(report)
     tell_run(run, name, job, done, report, folder, line)
 
