@@ -24,7 +24,7 @@ from g2ard.scene.regions import sky_mask
 from g2ard.scene.splats import SH_C0, Splats, check_finite
 from g2ard.stages.clean import FLOATING, KINDS, Cleaning, compare_depths, find_clutter
 
-_CLUTTER_VIEWS, _CLUTTER_SIDE = 96, 400
+CLUTTER_VIEWS, CLUTTER_SIDE = 96, 400
 """Number of generated views for finding clutter, and their longer side in pixels."""
 _CLUTTER_ROWS = 100_000
 """Gaussians that those views are planned on."""
@@ -131,9 +131,9 @@ def clean(
 
 def _views(splats: Splats, seed: int, progress: Progress, represents: float = 1.0) -> Cameras:
     """Return generated views that show clutter; `represents` is that of `plan_pool`."""
-    count = round(_CLUTTER_VIEWS * pool_times(represents * len(splats))) if represents > 1 else _CLUTTER_VIEWS
+    count = round(CLUTTER_VIEWS * pool_times(represents * len(splats))) if represents > 1 else CLUTTER_VIEWS
     how: dict[str, Any] = {"rows": _CLUTTER_ROWS, "near": _CLUTTER_NEAR, "represents": represents}
-    return plan_pool(splats, count, seed=seed, progress=progress, **how).cameras.resized(_CLUTTER_SIDE)
+    return plan_pool(splats, count, seed=seed, progress=progress, **how).cameras.resized(CLUTTER_SIDE)
 
 
 def _tell(clutter: Cleaning, light: float, kinds: Sequence[str], say: Say) -> None:

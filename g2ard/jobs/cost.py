@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from g2ard.errors import InputError
 from g2ard.io.sog_write import palette_size
 from g2ard.io.tile_store import row_width
+from g2ard.jobs.clean import CLUTTER_SIDE, CLUTTER_VIEWS
 from g2ard.jobs.distill_options import LEAST_RECOVERY_SHARE
 from g2ard.jobs.memory import RECOVERY_TIMES, TileMemory, TilePlan, amount
 from g2ard.jobs.run_views import within_pixels
@@ -47,6 +48,11 @@ _TILED = {
 """Microseconds per Gaussian of stages in tiles, in order: half to two thirds of the CPU time of guitar and
 150,000 Gaussians of playbot in tiles of 30,000 and 50,000. In larger tiles, 1 to 100 million Gaussians take
 5 to 7 in all (`docs/benchmarks.md`)."""
+_CLEANING = {"visibility": (0.5, 4e-6), "depths": (0.5, 6e-6), "clutter": (0.5, 7e-6)}
+"""Seconds of the stages of `clean`, and per Gaussian: 46 in all on showroom (2,751,651). In CPU time guitar
+takes 4.7 s, playbot 17.5 and taebak_park/0_0 9.4."""
+_CLEANING_BYTES = 750
+"""Bytes per Gaussian of `clean`; these three have 700 to 860."""
 _LIGHT = 0.0025
 """Seconds per view of `light`."""
 _IMAGE_FILE_BYTES = 6
@@ -208,6 +214,13 @@ def cost_of_reduction(reduce: Reduction, count: int) -> Cost:
     memory = _PROGRAM_BYTES + int(_SCENE_TIMES * reduce.dense.sample.nbytes)
     memory += _sampled(_SURVEY, reduce.total) if views else 0
     return Cost(views, pixels, 0, tuple(stages), memory)
+
+
+def cost_of_cleaning(count: int) -> Cost:
+    """Return the cost of finding the clutter among `count` Gaussians."""
+    stages = tuple((name, fixed + each * count) for name, (fixed, each) in _CLEANING.items())
+    memory = _PROGRAM_BYTES + _SURVEY[0] + _CLEANING_BYTES * count
+    return Cost(CLUTTER_VIEWS, CLUTTER_SIDE**2 * 3 // 4, 0, stages, memory)
 
 
 def _tiled_stages(plan: TilePlan, views: int, *, gaps: bool) -> list[tuple[str, float]]:

@@ -1,5 +1,6 @@
 """The inputs of a run of every command."""
 
+import shutil
 from pathlib import Path
 
 import pytest
@@ -12,3 +13,9 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("inputs")
     write_inputs(folder)
     return folder
+
+
+@pytest.fixture
+def work(inputs: Path, tmp_path: Path) -> Path:
+    """A copy of the inputs, where commands may write."""
+    return shutil.copytree(inputs, tmp_path / "work")

@@ -20,7 +20,7 @@ SHOWING = {
     "lod": "lod scene.ply -r 1 --merge-only -o out",
     "lod as 3D Tiles": "lod scene.ply -r 1 --merge-only --format 3dtiles -o out",
     "distill": "distill scene.ply -n 1 --steps 2 --size 24 -o run",
-    "clean": "clean scene.ply --dry-run --preview found.png",
+    "clean": "clean scene.ply --preview found.png",
     "compare": "compare scene.ply scene.ply -k 2 --size 24 -o page.html",
     "evaluate": "evaluate scene.ply scene.ply --teacher scene.ply --size 24 -o page.html",
 }

@@ -2,7 +2,6 @@
 
 import re
 import shlex
-import shutil
 from pathlib import Path
 from typing import Any
 
@@ -29,10 +28,9 @@ CALLS = {
 
 @pytest.mark.parametrize("words", CALLS.values(), ids=CALLS)
 def test_pages_render_no_scored_view_again(
-    words: str, inputs: Path, tmp_path: Path, command_line: CommandLine, monkeypatch: pytest.MonkeyPatch
+    words: str, work: Path, command_line: CommandLine, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    folder, drawn = tmp_path / "work", [set[Any](), set[Any]()]
-    shutil.copytree(inputs, folder)
+    drawn = [set[Any](), set[Any]()]
     image, write_pages, paging = Renderer.image, RunFolder.write_pages, []
 
     def drawing(renderer: Renderer, camera: Any) -> Any:
@@ -47,8 +45,8 @@ def test_pages_render_no_scored_view_again(
 
     monkeypatch.setattr(Renderer, "image", drawing)
     monkeypatch.setattr(RunFolder, "write_pages", writing)
-    succeeds(command_line, folder, *shlex.split(words), "--no-page", "-o", "out")
-    page = (folder / "out" / "report.html").read_text(encoding="utf-8")
+    succeeds(command_line, work, *shlex.split(words), "--no-page", "-o", "out")
+    page = (work / "out" / "report.html").read_text(encoding="utf-8")
     assert "Worst views" in page
     lost = re.findall("ended below their start: (\\w+)", page)  # shown even if others are worse
     assert {name for *_, name, _ in drawn[0] & drawn[1]} <= {*lost}

@@ -1,13 +1,13 @@
 """Dry runs look at sizes and counts alone: they draw, merge and train nothing."""
 
 import shlex
-import shutil
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from g2ard import _core
+from g2ard.cli import app
 from helpers.calls import CALLS, ON, options_of
 from helpers.commands import CommandLine, succeeds
 
@@ -18,12 +18,8 @@ KERNELS += ("cast_rays", "simplify_flags", "simplify_paper", "simplify_pairwise"
 FEW = 15
 """Images of 160 pixels that tell whether photos show the scene."""
 
-PLANNED = {
-    name: words
-    for name, words in CALLS.items()
-    if name.split()[0] != "clean" and "dry_run" in options_of(name)
-}
-"""Calls of commands with a dry run, except that of `clean`, which tells what it finds in renders."""
+PLANNED = {name: words for name, words in CALLS.items() if "dry_run" in options_of(name)}
+"""Calls of commands with a dry run."""
 
 CASES = {
     **PLANNED,
@@ -51,11 +47,9 @@ CASES = {
 
 @pytest.mark.parametrize("words", CASES.values(), ids=CASES)
 def test_a_dry_run_runs_no_kernel(
-    words: str, inputs: Path, tmp_path: Path, command_line: CommandLine, monkeypatch: pytest.MonkeyPatch
+    words: str, work: Path, command_line: CommandLine, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    folder = tmp_path / "work"
-    shutil.copytree(inputs, folder)
-    before = sorted(folder.rglob("*"))
+    before = sorted(work.rglob("*"))
     for name in KERNELS:
 
         def kernel(*_: Any, name: str = name, **__: Any) -> None:
@@ -74,17 +68,21 @@ def test_a_dry_run_runs_no_kernel(
 
     rasterizer = _core.Rasterizer
     monkeypatch.setattr(_core, "Rasterizer", Counted)
-    told = succeeds(command_line, folder, *shlex.split(words), "--dry-run", "--json", "-")
+    told = succeeds(command_line, work, *shlex.split(words), "--dry-run", "--json", "-")
     assert "nothing is written" in told.err
-    assert sorted(folder.rglob("*")) == before
+    assert sorted(work.rglob("*")) == before
     assert len(drawn) <= FEW * ("photos" in words)
 
 
-def test_a_dry_run_is_close_to_its_run(inputs: Path, tmp_path: Path, command_line: CommandLine) -> None:
+def test_every_command_with_a_dry_run_is_here() -> None:
+    planned = {name for name in app.COMMANDS if "dry_run" in options_of(name)}
+    assert planned == {name.split()[0] for name in PLANNED}
+
+
+def test_a_dry_run_is_close_to_its_run(work: Path, command_line: CommandLine) -> None:
     """The views of a dry run are stand-ins of as many that are generated."""
     import json
 
-    shutil.copytree(inputs, tmp_path / "work")
     ask = (
         "distill",
         "ball.ply",
@@ -100,8 +98,8 @@ def test_a_dry_run_is_close_to_its_run(inputs: Path, tmp_path: Path, command_lin
         "--json",
         "-",
     )
-    told = json.loads(succeeds(command_line, tmp_path / "work", *ask, "--dry-run").out)
-    ran = json.loads(succeeds(command_line, tmp_path / "work", *ask).out)
+    told = json.loads(succeeds(command_line, work, *ask, "--dry-run").out)
+    ran = json.loads(succeeds(command_line, work, *ask).out)
     assert (told["count"], told["steps"]) == (ran["output_count"], 60)
     scored = sum(kind["views"] for kind in ran["kinds"] if "2×" not in kind["kind"])
     assert scored <= told["views"] <= 6 * scored

@@ -1,7 +1,6 @@
 """Each scene or point cloud that a command is given is looked into once, and opened once."""
 
 import shlex
-import shutil
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
@@ -32,10 +31,8 @@ def test_every_command_is_here() -> None:
 
 @pytest.mark.parametrize("words", READING.values(), ids=READING)
 def test_an_input_is_opened_once(
-    words: str, inputs: Path, tmp_path: Path, command_line: CommandLine, monkeypatch: pytest.MonkeyPatch
+    words: str, work: Path, inputs: Path, command_line: CommandLine, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    folder = tmp_path / "work"
-    shutil.copytree(inputs, folder)
     looked, opened = Counter[str](), Counter[str]()
 
     def counted(read: Callable[..., Any], found: Counter[str], path_of: Callable[..., Path]) -> Any:
@@ -49,7 +46,7 @@ def test_an_input_is_opened_once(
     monkeypatch.setattr(detect, "_of_file", counted(uncached, looked, lambda path, *_: path))
     opening = Source._opened
     monkeypatch.setattr(Source, "_opened", counted(opening, opened, lambda source, _: source.file))
-    succeeds(command_line, folder, *shlex.split(words))
+    succeeds(command_line, work, *shlex.split(words))
     given = Counter(word for word in shlex.split(words) if word.endswith(".ply") and (inputs / word).exists())
     assert given
     for name, times in given.items():  # a scene may be the teacher too

@@ -43,7 +43,7 @@ REDUCE = "simplify ball.ply --no-views"
         f"adapt ball.ply {TRAIN} -o c.ply --json .c.ply.work/steps.npz",
         "lod ball.ply -r 4,8 --merge-only --views views.json -o c --json .c.unfinished/level.npz",
         "clean sky.ply -o c.ply --split-sky c.ply",
-        "clean sky.ply --dry-run --preview c.png --json c.png",
+        "clean sky.ply --preview c.png --json c.png",
         "render ball.ply --views views.json -o c --sheet c/view_003.png",
         "render ball.ply --views views.json -o c --depth --json c/view_003.depth.npy",
         "poses ball.ply -k 4 -o model --json model/sparse/0/cameras.txt",

@@ -127,7 +127,7 @@ CALLS: dict[str, tuple[str, str]] = {
     "convert from_axes": ("RDF", "convert ball.ply out.ply --from-axes {}"),
     "convert to_axes": ("y-up z-up RFU", "convert ball.ply out.ply --to-axes {}"),
     "clean only": (" ".join([*KINDS, "none"]), "clean sky.ply --only {} -o out.ply"),
-    "clean strength": ("0 1", "clean sky.ply --strength {} --dry-run"),
+    "clean strength": ("0 1", "clean sky.ply --strength {} -o out.ply"),
     "lod output": (
         "lod-meta.json tileset.json",
         "lod ball.ply -r 2,4 --merge-only --views views.json -o out {}",

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from g2ard.cli.command import command
-from g2ard.cli.options import SceneArgument, picture
+from g2ard.cli.options import DryRunOption, SceneArgument, picture
 from g2ard.cli.run import Run
+from g2ard.cli.run_result import memory_of
 from g2ard.errors import InputError
+from g2ard.io import Source
 from g2ard.progress import plural
 
 if TYPE_CHECKING:
@@ -67,12 +70,12 @@ def clean(
     preview: Annotated[
         Path | None,
         typer.Option(
-            parser=picture, metavar="FILE.png", help="Picture with the removed Gaussians coloured by kind."
+            parser=picture,
+            metavar="FILE.png",
+            help="Picture with the removed Gaussians coloured by kind. Without -o, only this is written.",
         ),
     ] = None,
-    dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Report what would be removed, write no scene.")
-    ] = False,
+    dry_run: DryRunOption = False,
 ) -> None:
     """Remove clutter: invisible Gaussians, giants, needles, floaters; haze on request.
 
@@ -80,39 +83,40 @@ def clean(
     """
     from g2ard.jobs.clean import clean as remove_clutter
     from g2ard.jobs.clean import kinds_of
+    from g2ard.jobs.cost import cost_of_cleaning
 
     kinds = None if only is None else tuple(word.strip() for word in only.split(",") if only != "none")
     with run.usage():
         kinds_of(kinds, strength)
     if preview is not None and kinds == ():
         raise typer.BadParameter("--preview shows clutter, so that it does not go with --only none")
-    if output is None and not dry_run:
-        raise typer.BadParameter("give an output with -o, or --dry-run")
+    if output is None and (preview is None or split_sky is not None):
+        raise typer.BadParameter("give an output with -o, or only --preview")
+    source = Source(scene, run.render_model)
+    if dry_run:
+        _tell_plan(run, source.scene.count)
+        return
     if preview is not None:
         run.claim_file("--preview", preview)
     for flag, path in (("--output", output), ("--split-sky", split_sky)):
-        if path is not None and not dry_run:
+        if path is not None:
             run.claim_scene(flag, path)
     drawn = [("preview", 1)] if preview is not None else []
-    run.console.expect([("visibility", 11), ("depths", 16), ("clutter", 19), *drawn])  # showroom, s
-    run.begin("read")
+    run.console.expect([*cost_of_cleaning(source.scene.count).stages, *drawn])
     done = remove_clutter(
-        scene,
+        run.load(source),
         only=kinds,
         strength=strength,
         split_sky=split_sky is not None,
-        render_model=run.render_model,
         seed=run.seed,
         progress=run.progress,
-        say=run.answer if dry_run else run.say,
+        say=run.answer if output is None else run.say,
     )
     total, kept = len(done.before), int(done.clutter.keep.sum())
     sky_count = 0 if done.sky is None else len(done.sky)
-    if not dry_run and output is not None:
+    if output is not None:
         if not kept:
-            raise InputError(
-                "every Gaussian would be removed; inspect it with --dry-run --preview", path=scene
-            )
+            raise InputError("every Gaussian would be removed; give --preview without -o", path=scene)
         run.write(output, done.splats)
         run.say(f"{output}: keeps {kept:,} of {plural(total, 'Gaussian')}")
         if split_sky is not None and done.sky is not None:
@@ -126,6 +130,19 @@ def clean(
             run.say(f"picture: {preview}")
     counts = {"input_count": total + sky_count, "output_count": kept, "found": done.clutter.counts}
     run.result(counts if done.sky is None else {**counts, "sky_count": sky_count})
+
+
+def _tell_plan(run: Run, count: int) -> None:
+    """Print the rough time and memory of cleaning `count` Gaussians."""
+    from g2ard.jobs.cost import cost_of_cleaning
+
+    cost = cost_of_cleaning(count)
+    run.answer(
+        f"{plural(count, 'Gaussian')}, looked at in {cost.views} views: roughly {max(1, cost.seconds):.0f} s "
+        f"on two cores and {memory_of(cost)}"
+    )
+    run.say_dry()
+    run.result({"count": count, **asdict(cost), "seconds": cost.seconds})
 
 
 def _paint(path: Path, done: Cleaned, cameras: Cameras, overwrite: bool) -> None:
