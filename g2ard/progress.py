@@ -71,7 +71,7 @@ def show_progress(stage: str, done: int, total: int, info: Mapping[str, Any] | N
     elif ended or now - _line.drawn >= (0.1 if terminal else 1):
         _line.drawn = now
         text = f"{stage}: {done:,}/{total:,}" if total > 1 else stage
-        if shell is not None and total > 1:
+        if shell is not None and total:
             filled = _BAR * done // total
             spent = now - _line.began
             left = f"{spent * (total - done) / done:.0f} s left" if 0 < done < total else f"{spent:.1f} s"

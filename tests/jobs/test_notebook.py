@@ -182,6 +182,12 @@ def test_progress_is_one_line_per_cell(
     assert "█" * 20 in first[-1]
 
 
+def test_progress_ends_with_the_last_stage(monkeypatch: pytest.MonkeyPatch) -> None:
+    shell = Shell(monkeypatch)
+    g2ard.simplify(BALL, count=100, progress=g2ard.show_progress)
+    assert "█" * 20 in shell.cells[-1][-1]
+
+
 def test_errors_of_users_are_one_line_in_a_notebook() -> None:
     calls: list[Any] = [
         lambda: g2ard.load("missing.ply"),

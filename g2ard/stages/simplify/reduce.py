@@ -233,6 +233,7 @@ def simplify(
         progress("gaps", 0, 0)
         dense = scene.with_sh_degree(0).take(scene.core.order)  # ties in depth go by row
         lost = opacity_lost(dense, splats_of(scene, out), views)
+        progress("gaps", 1, 1)
     return _simplified(splats, finite, out, lost)
 
 
