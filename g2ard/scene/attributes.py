@@ -140,7 +140,8 @@ def _tree(text: str) -> ast.expr:
     try:
         return ast.parse(text.strip(), mode="eval").body
     except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
-        raise _invalid(f"{text!r} is not a condition") from error
+        examples = "'opacity > 0.05' or, of points, 'classification == 2'"
+        raise _invalid(f"{text!r} is not a condition, such as {examples}") from error
 
 
 def _value(node: ast.expr, columns: _Columns) -> Any:

@@ -99,6 +99,7 @@ def test_convert_keeps_what_fulfils_a_condition(tmp_path: Path, command_line: Co
         ("min(x) > 0", "min takes several numbers"),
         ("x > 1; y > 1", "is not a condition"),
         ("x >", "is not a condition"),
+        ("class == 2", "such as 'opacity > 0.05' or, of points, 'classification == 2'"),
         ("-" * 900 + "x > 0", ""),
         ("(" * 900 + "x" + ")" * 90, ""),
         ("x > " + "1" * 2000, "at most 1000 characters"),
