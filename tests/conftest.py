@@ -23,7 +23,7 @@ from typer.main import get_command as typer_parser
 import g2ard
 from g2ard.io import write_views
 from helpers.keys import lasting_keys
-from helpers.plans import FOLDER, SIZE, share_plans
+from helpers.plans import FOLDER, plan_small_scenes, share_plans
 from helpers.project import environment
 from helpers.scenes import around, checkered_ball
 
@@ -158,6 +158,8 @@ def _here(words: list[str], cwd: Path, env: dict[str, str]) -> Said:
 
 _USUAL_VIEWS = {"test_floors", "test_generated_views", "test_notes", "test_stopped_runs"}
 """Modules whose generated views have the usual size, as their numbers and kinds depend on it."""
+_UNSCORED = {"cli", "levels", "report", "viewer"}
+"""Folders whose tests ask for no score, so that views need not be placed well."""
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -165,7 +167,10 @@ def shared_plans(request: pytest.FixtureRequest) -> Iterator[None]:
     """Share planned views between all tests but those of planning."""
     with pytest.MonkeyPatch.context() as patches:
         if request.path.parent.name != "poses":
-            share_plans(patches, **{} if request.path.stem in _USUAL_VIEWS else {"size": SIZE})
+            if request.path.stem in _USUAL_VIEWS:
+                share_plans(patches)
+            else:
+                plan_small_scenes(patches, coarse=request.path.parent.name in _UNSCORED)
         yield
 
 

@@ -15,9 +15,11 @@ from typing import Any
 
 import pytest
 
+from g2ard.poses import matter
 from g2ard.poses.pool import Pool, plan_pool
+from g2ard.poses.showing import best_views
 from g2ard.progress import Progress, silent
-from g2ard.scene.cameras import Camera
+from g2ard.scene.cameras import Camera, Cameras
 from g2ard.scene.splats import Splats
 
 FOLDER = "G2ARD_TEST_PLANS"
@@ -28,24 +30,47 @@ _IMPORTERS = [
     *("g2ard.jobs.run_views", "benchmarks.views", "benchmarks.kinds.select"),
 ]
 """Modules that have `plan_pool`."""
+_SHOWING = ["g2ard.jobs.run_views", "g2ard.jobs.notebook", "g2ard.jobs.viewer_frame", "g2ard.jobs.distill"]
+"""Modules that have `best_views`."""
 _MOST = 100
 """Plans that are kept in memory."""
 SIZE = (440, 330)
 """Size of generated views in tests that draw hundreds: a third of the usual pixels; `clean` draws at 400."""
+_CELLS = (200_000, 6_000_000)
+"""Cells of occupancy grids: of small scenes, the usual two million are most of the time of planning."""
+_FULL_PIXELS = 4 * SIZE[0] * SIZE[1]
+"""Pixels that are scored at full size."""
 
 _plans: OrderedDict[str, Any] = OrderedDict()
 
 
 def share_plans(monkeypatch: pytest.MonkeyPatch, **options: Any) -> None:
     """Plan a scene's views once for all processes; tests/poses tests that plans are the same each time."""
-    for name in _IMPORTERS:  # first all, or one would import another's patch for good
+    for name in (*_IMPORTERS, *_SHOWING):  # first all, or one would import another's patch for good
         import_module(name)
     for name in _IMPORTERS:
         monkeypatch.setattr(f"{name}.plan_pool", partial(_shared, **options))
+    for name in _SHOWING:
+        monkeypatch.setattr(f"{name}.best_views", _shown)
+
+
+def plan_small_scenes(monkeypatch: pytest.MonkeyPatch, *, coarse: bool = True) -> None:
+    """Share plans of smaller views, `coarse` ones in coarser grids, and score few views at full size."""
+    share_plans(monkeypatch, size=SIZE)
+    monkeypatch.setattr("g2ard.jobs.run_views.FULL_PIXELS", _FULL_PIXELS)
+    if coarse:
+        monkeypatch.setattr("g2ard.poses.matter._CELLS", _CELLS)
+
+
+def _shown(splats: Splats, count: int = 1, cameras: Cameras | None = None, **options: Any) -> Cameras:
+    if cameras is not None:
+        return best_views(splats, count, cameras, **options)  # has paths of photos, which no key holds
+    key = f"best {splats.fingerprint()} {splats.up} {count} {matter._CELLS} {sorted(options.items())}"
+    return _kept(key, lambda: best_views(splats, count, **options))
 
 
 def _shared(splats: Splats, *count: int, progress: Progress = silent, **options: Any) -> Pool:
-    key = f"{splats.fingerprint()} {count} {sorted(options.items())}"
+    key = f"{splats.fingerprint()} {splats.up} {count} {matter._CELLS} {sorted(options.items())}"
     plan = cache(lambda: plan_pool(splats, *count, progress=progress, **options))
 
     def more(kind: str, wanted: int) -> list[Camera]:

@@ -85,9 +85,9 @@ def _serve() -> None:
 
     from g2ard.cli import console
     from g2ard.cli.app import COMMANDS
-    from helpers.plans import SIZE, share_plans
+    from helpers.plans import plan_small_scenes
 
-    share_plans(pytest.MonkeyPatch(), size=SIZE)
+    plan_small_scenes(pytest.MonkeyPatch())
 
     # Commands on tiny scenes end before the live line would appear.
     console._LIVE_LINE_DELAY, console._LIVE_LINE_PERIOD, console._SILENT_SECONDS = 0.0, 0.02, 0.04  # type: ignore[misc]
