@@ -222,8 +222,9 @@ DISTILL: dict[str, Any] = {
 }
 HANDED_ON = {"simplify.fold", "recover.ssim_weight", "recover.regularizers.anchor", "recover.schedule.reach"}
 FEW = {name: value for name, value in DISTILL.items() if name.startswith("select.") or name in HANDED_ON}
-"""Settings that a whole distillation is tried with: stages get theirs as one object, so few tell for all.
-In tiles all are tried."""
+"""Settings that a whole distillation is tried with: stages get theirs as one object, so few tell for all."""
+IN_TILES = FEW | {name: DISTILL[name] for name in ("recover.background", "recover.sh_degree")}
+"""Settings that a distillation in tiles is tried with: two more, because tiles draw its targets."""
 UNEVEN = ViewSet(VIEWS, splits=("train",) * 7 + ("test",), weights=np.arange(8.0) ** 2)
 BUDGET = 80
 
@@ -270,7 +271,7 @@ RUNS: dict[str, tuple[Callable[[Mapping[str, Any]], object], dict[str, Any]]] = 
     **dict.fromkeys(("adapt", "adapt paper"), (_adapted, ADAPT)),
     **dict.fromkeys(("register sift", "register direct"), (_registered, REGISTER)),
     "distill": (_distilled, FEW),
-    "distill in tiles": (_distilled_in_tiles, DISTILL),
+    "distill in tiles": (_distilled_in_tiles, IN_TILES),
 }
 RECOVERY: dict[str, Any] = {"steps": 6, "regularizers.period": 1, "regularizers.shape": 1.0}
 RECOVERY_BESIDE: dict[str, dict[str, Any]] = {
