@@ -77,7 +77,7 @@ def study(
     return run
 
 
-SMALL = ("--set", "released=false", "--ratios", "2", "--set", "steps=20", "--size", "48")
+SMALL = ("--set", "released=false", "--ratios", "2", "--seeds", "0", "--set", "steps=20", "--size", "48")
 
 
 @needs_processes

@@ -5,6 +5,7 @@ import os
 import re
 import shutil
 import warnings
+from collections import Counter
 from collections.abc import Callable
 from functools import cache, partial
 from itertools import groupby
@@ -17,6 +18,8 @@ import pytest
 from g2ard import _core
 from g2ard.cli.app import COMMANDS
 from g2ard.cli.console import Console
+from g2ard.io import detect
+from g2ard.io.source import Source
 from g2ard.stages.recover import checkpoint
 from g2ard.tiles import tasks
 from helpers.calls import CALLS, FIRST, WRITING, options_of, output_of
@@ -58,9 +61,12 @@ def test_every_command_has_a_call() -> None:
 
 
 class Watched:
-    """Stages that a command expects and meets, and kernels that it runs within and outside of them."""
+    """Stages that a command expects and meets, kernels that it runs within and outside of them, and how often
+    it detects and opens each file."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.detected: Counter[str] = Counter()
+        self.opened: Counter[str] = Counter()
         self.expected: list[str] = []
         self.met: list[str] = []
         self.inside: set[str] = set()
@@ -84,6 +90,18 @@ class Watched:
         for name, kernel in list(vars(_core).items()):
             if isinstance(kernel, BuiltinFunctionType) and name not in CHEAP:
                 monkeypatch.setattr(_core, name, partial(self._call, kernel))
+        detect_file, open_source = detect._of_file.__wrapped__, Source._opened  # the former without its cache
+
+        def detecting(path: Path, *more: Any) -> Any:
+            self.detected[path.resolve().name] += 1
+            return detect_file(path, *more)
+
+        def opening(source: Source, *more: Any) -> Any:
+            self.opened[source.file.resolve().name] += 1
+            return open_source(source, *more)
+
+        monkeypatch.setattr(detect, "_of_file", detecting)
+        monkeypatch.setattr(Source, "_opened", opening)
 
     def _call(self, kernel: Callable[..., Any], *arguments: Any, **named: Any) -> Any:
         stage = self.console and self.console._stage
@@ -142,6 +160,26 @@ def test_kernels_run_within_stages_that_were_expected(words: str, ran: Ran) -> N
     missed = [stage for stage in watched.expected if stage not in OPTIONAL and stage not in met]
     assert not missed, (watched.expected, watched.met)
     assert watched.expected or words.split()[0] not in ("distill", "recover", "simplify", "lod", "compare")
+
+
+READING = [
+    *CALLS.values(),
+    "info ball.ply cloud.ply",
+    "simplify cloud.ply -r 4 --no-views -o lifted.ply",
+    *(
+        f"{CALLS[name]} --dry-run"
+        for name in ("distill", "distill tiles", "simplify", "simplify tiles", "recover", "lod")
+    ),
+]
+
+
+@pytest.mark.parametrize("words", READING)
+def test_an_input_is_opened_once(words: str, inputs: Path, ran: Ran) -> None:
+    _, watched = ran(words)
+    given = Counter(word for word in words.split() if word.endswith(".ply") and (inputs / word).exists())
+    assert given
+    for name, times in given.items():  # a scene may be the teacher too
+        assert (watched.detected[name], watched.opened[name]) == (times, times), name
 
 
 @pytest.mark.parametrize("name", WRITING)
