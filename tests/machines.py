@@ -25,6 +25,9 @@ BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stab
 EXTRAS = ("backports.zstd", "distributed", "pxr", "pycolmap", "pye57", "pyproj")
 """Modules of the optional dependencies, except torch, which the tests import."""
 
+_PROCESSES = 2
+"""Processes that run tests, as in `make test`."""
+
 NOWHERE = "/nonexistent"
 _NOT_ROOT = ("unshare", "--user", "--map-user=1000", "--map-group=1000")
 """A command without root's rights, that still reads root's files."""
@@ -91,7 +94,7 @@ _OLD_PROCESSOR = {
 """Older code of numpy, OpenBLAS and the C library, and one thread; kernels without vector instructions are
 chosen by `--isa`."""
 
-_ON_DISK = ("tests/io/test_atomic.py", "tests/io/test_paths.py", "tests/cli/test_outputs.py")
+_FILES = ("tests/io/test_atomic.py", "tests/io/test_paths.py")
 
 TRAITS: dict[str, Trait] = {
     "ffmpeg": Trait(
@@ -141,8 +144,8 @@ TRAITS: dict[str, Trait] = {
         variables={"LC_ALL": "C", "LANG": "C"},
     ),
     "time zone": Trait(_always, tests=("tests/cli/test_info.py",), variables={"TZ": "Pacific/Kiritimati"}),
-    "umask": Trait(partial(hasattr, os, "fork"), tests=_ON_DISK, umask=0o077),
-    "root": Trait(_is_root, tests=_ON_DISK, prefix=_NOT_ROOT),
+    "umask": Trait(partial(hasattr, os, "fork"), tests=_FILES, umask=0o077),
+    "root": Trait(_is_root, tests=(*_FILES, "tests/cli/test_outputs.py"), prefix=_NOT_ROOT),
 }
 """Name → trait. `tests/test_machines.py` looks for others in the sources."""
 
@@ -190,7 +193,10 @@ def run(traits: Sequence[Trait]) -> int:
     commands = [[*word.split(), "--jobs", "1"] for word in wanted if word.startswith("tests/goldens.py")]
     tests = [word for word in wanted if not word.startswith("tests/goldens.py")]
     if tests:
-        commands.append(["-m", "pytest", "-p", "no:cacheprovider", "--no-header", *tests])
+        files = {test.partition("::")[0] for test in tests}
+        processes = str(_PROCESSES if len(files) > 1 else 0)  # a file stays in one, with its fixtures
+        options = ["-p", "no:cacheprovider", "--no-header", "--numprocesses", processes, "--dist", "loadfile"]
+        commands.append(["-m", "pytest", *options, *tests])
     with tempfile.TemporaryDirectory(prefix="machine") as folder:
         environment = other_machine(traits, Path(folder))
         return max(
