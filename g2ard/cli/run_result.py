@@ -170,7 +170,7 @@ def say_fit(run: Run, source: Path, budget: Budget, name: str) -> None:
     if next((suffix for suffix in suffixes if source.name.lower().endswith(suffix)), None) == ours:
         run.say(f"nothing to do: {fits}")
     else:
-        run.say(f"{fits}; as {ours} it is larger, and reduced to fit")
+        run.say(f"{fits}; only its size as {ours} counts")
 
 
 def say_weight(run: Run, source: Path, output: Path, splats: Splats, *, lifted: Splats | None = None) -> None:

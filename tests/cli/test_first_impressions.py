@@ -89,7 +89,7 @@ def test_a_file_that_fits_needs_nothing(folder: Path, command_line: CommandLine)
         "small.ply",
     )
     told = succeeds(command_line, folder, *ask).err
-    assert "which already fits" in told
+    assert "kB; only its size as .ply counts" in told
     assert "nothing to do" not in told
     assert len(g2ard.load(folder / "small.ply")) < len(BALL)
 
