@@ -12,7 +12,8 @@ use crate::linalg::{dot, sub};
 ///
 /// In an unbounded scene, areas grow with the square of the distance from where its photos were taken: a trainer splits
 /// what is larger than a pixel or two. Such a scene says where people stand, and m is its mass over the squared
-/// distance from there. Otherwise a few Gaussians of a remote sky would outweigh all that is near.
+/// distance from there. Otherwise a few Gaussians of a remote sky would outweigh all that is near. There, too, all have
+/// nearly equal weight: each covered about a pixel of the photo that was nearest to it.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Importance {
     /// a.
@@ -127,8 +128,11 @@ impl Importance {
                 .map(|&m| (f64::from(m).ln(), 0.0)),
         );
         let spread = ramp(masses.deviation(), SPREAD);
-        let follows = ramp(sizes.correlation(), FOLLOWS) * (1.0 - found.angular);
-        found.exponent = LEAST + (1.0 - LEAST) * (1.0 - spread * (1.0 - follows));
+        let follows = ramp(sizes.correlation(), FOLLOWS);
+        let equal = found
+            .angular
+            .max(spread * (1.0 - follows * (1.0 - found.angular)));
+        found.exponent = LEAST + (1.0 - LEAST) * (1.0 - equal);
         found.usual = f64::from(median(apparent).unwrap_or(1.0));
         found
     }
@@ -151,7 +155,7 @@ impl Importance {
         }
     }
 
-    /// How far small Gaussians carry the detail in a scene that says where people stand, 0 to 1.
+    /// How far a scene that says where people stand has small Gaussians that carry the detail, 0 to 1.
     pub fn small_carry_detail(&self) -> f64 {
         (1.0 - self.exponent) * self.angular
     }
@@ -319,7 +323,7 @@ mod tests {
     fn sizes_that_grow_with_the_distance_count_as_they_look() {
         let nodes = line(500, receding, |i| 0.01 * receding(i));
         let by = measured(&nodes);
-        assert_eq!((by.exponent, by.angular), (1.0, 1.0));
+        assert_eq!((by.exponent, by.angular), (LEAST, 1.0));
         let (near, far) = (by.of(&nodes[200]), by.of(&nodes[499]));
         assert!((0.5..2.0).contains(&(near / far)), "{near} {far}");
         assert!(nodes[499].mass > 1e4 * nodes[200].mass);
