@@ -146,7 +146,8 @@ def test_a_page_fits_its_bytes_and_holds_the_result_alone(
     options: str, made: Path, tmp_path: Path, command_line: CommandLine
 ) -> None:
     g2ard.save(tmp_path / "ball.ply", checkered_ball(3000))
-    ask = ("distill", "ball.ply", *options.split(), "--views", made / "views.json", "--steps", 2, "-o", "run")
+    ask = ("distill", "ball.ply", *options.split(), "--views", made / "views.json", "--steps", 2)
+    ask = (*ask, "--focus", "far", "-o", "run")
     succeeds(command_line, tmp_path, *ask)
     page = tmp_path / "run" / "view.html"
     (label,) = Text(page).labels

@@ -301,7 +301,7 @@ ON: dict[str, dict[str, str]] = {
     },
     "select": {"images": "select ball.ply --views sizeless.json -k 4 -o out.json"},
     "distill": {
-        **dict.fromkeys(_CHOICES, "distill scan.las -r 8 --steps 3 --size 24 --no-page -o out"),
+        **dict.fromkeys(_CHOICES, f"distill scan.las -r 8 {_TRAINED} --photos --no-page -o out"),
         "views_format": "distill ball.ply -r 8 --steps 3 --size 24 --views made --no-page -o out",
         "compare": "distill ball.ply -r 8 --steps 3 --size 24 --views photos.json --renders -o out",
     },
@@ -313,7 +313,7 @@ ON: dict[str, dict[str, str]] = {
         "invert": "convert ball.ply --sphere 0,0,0.5,0.9 -o out.ply",
     },
     "lod": {
-        **dict.fromkeys(_CHOICES, "lod scan.las -r 1,4 --size 24 --merge-only -o out"),
+        **dict.fromkeys(_CHOICES, "lod scan.las -r 1,4 --views views.json --size 24 --merge-only -o out"),
         "images": "lod ball.ply -r 1,4 --views sizeless.json --steps 3 -o out",
         "steps": "lod ball.ply -r 1,4 --views photos.json --size 24 -o out",
         "place": "lod ball.ply -r 4,8 --views photos.json --size 24 --merge-only --format 3dtiles -o out",

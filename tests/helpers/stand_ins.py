@@ -40,6 +40,7 @@ steps = 5
 steps = 5
 [recover]
 size = 48
+steps = 5
 [compare]
 size = 48
 looks = 4

@@ -103,7 +103,7 @@ _DISTIL = "--steps 4 --size 200"
 _GIVEN = "--views views.json --focus far"
 MEASURED = {
     "distil SH 0": f"distill 60000_0.ply -r 10 {_DISTIL} {_GIVEN}",
-    "distil SH 1": f"distill 20000_1.ply -r 4 {_DISTIL} --focus far",
+    "distil SH 1": f"distill 20000_1.ply -r 4 {_DISTIL} {_GIVEN}",
     "distil SH 3": f"distill 20000_3.ply -r 10 {_DISTIL}",
     "distil without a page": f"distill 60000_3.ply -r 10 {_DISTIL} {_GIVEN} --no-page",
     "distil larger views": "distill 20000_0.ply -r 4 --steps 4 --size 500 --focus far --no-page",
