@@ -391,13 +391,18 @@ def tree(folder: Path) -> dict[str, str]:
     return {str(path): digest(path.read_bytes()) for path in sorted(folder.rglob("*")) if path.is_file()}
 
 
+_HASH = re.compile(r"-[0-9a-f]{16}(?=\.)")
+"""Part of a step's name that depends on what the processor has computed before."""
+
+
 def differences(was: Found, now: Found, elsewhere: bool) -> list[str]:
     """Return what differs between two lines of the record; that an interrupted run ends better does not."""
     pairs = zip(was.get("again", []), now.get("again", []), strict=False)
     again = [end for before, end in pairs if before == SAME != end]
     if elsewhere:
         lines = [key for key in ("status", "keys") if was[key] != now[key]]
-        return [*lines, *sorted(was["files"].keys() ^ now["files"].keys()), *again]
+        before, after = ({_HASH.sub("", name) for name in line["files"]} for line in (was, now))
+        return [*lines, *sorted(before ^ after), *again]
     lines = [*again, *(key for key in ("status", "keys", "out", "err") if was[key] != now[key])]
     old, new = was.get("errors", []), now.get("errors", [])
     lines += [f"- {error}" for error in old if error not in new]

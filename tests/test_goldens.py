@@ -48,7 +48,7 @@ LINE: goldens.Found = {
     "out": "o",
     "err": "e",
     "keys": "k",
-    "files": {"a": "1"},
+    "files": {"a": "1", "b-0123456789abcdef.npz": "2"},
     "again": ["same"],
 }
 
@@ -60,9 +60,11 @@ LINE: goldens.Found = {
         ({"status": [0]}, True),
         ({"keys": "other"}, True),
         ({"files": {}}, True),
-        ({"files": {"a": "1", "b": "2"}}, True),
+        ({"files": {"a": "1"}}, True),
+        ({"files": LINE["files"] | {"c": "3"}}, True),
         ({"again": ["killed after 1 of 2 files"]}, True),
-        ({"files": {"a": "2"}}, False),
+        ({"files": LINE["files"] | {"a": "2"}}, False),
+        ({"files": {"a": "1", "b-fedcba9876543210.npz": "2"}}, False),
         ({"out": "other"}, False),
         ({"err": "other"}, False),
         ({"errors": ["g2ard: 4 views lost"]}, False),
