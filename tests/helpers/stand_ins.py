@@ -53,13 +53,15 @@ size = 48
 
 
 def shrunk(words: Sequence[str]) -> list[str]:
-    """Divide counts of Gaussians (500 at most) and of steps by a hundred, and shrink turntables.
+    """Divide counts of Gaussians (500 at most) and of steps by a hundred, and shrink turntables and times.
 
-    >>> shrunk(["distill", "-n", "20k", "--steps", "3000"])
-    ['distill', '-n', '200', '--steps', '30']
+    >>> shrunk(["distill", "-n", "20k", "--steps", "3000", "--time", "2m"])
+    ['distill', '-n', '200', '--steps', '30', '--time', '5s']
     """
     found = list(words)
     for i, (option, value) in enumerate(pairwise(words), 1):
+        if option == "--time":
+            found[i] = "5s"
         number = re.fullmatch(r"([\d.]+)([kM]?)", value)
         if number is None:
             continue
