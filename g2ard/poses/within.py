@@ -17,6 +17,9 @@ _ROOM_PITCHES, _WALK_PITCHES, _SHARP_PITCHES = (-0.3, 0.2), (-25.0, 10.0), (-35.
 _EYES = {True: (0.35, 0.75), False: (0.2, 0.6)}
 """Range of eye heights above the ground: indoors in heights of the room, outdoors in `Site.tallness`."""
 
+_UNDER_A_DOME = (0.1, 0.5)
+"""The same below a ceiling that is no room's, in its height: it may be much higher than people."""
+
 WIDE = 70.0
 """Horizontal field of view in degrees: within a scene people use wider lenses."""
 
@@ -115,14 +118,16 @@ def plan_walk(survey: Survey, count: int, shift: int = 0, *, indoors: bool | Non
     Gazes into a near wall or leaves, or out of the scene, are dropped. `indoors`, places lie between walls;
     otherwise under an open sky. None means indoors if the scene is a room.
     """
-    site, indoors = survey.site, is_room(survey) if indoors is None else indoors
+    site, room_like = survey.site, is_room(survey)
+    indoors = room_like if indoors is None else indoors
+    heights = _UNDER_A_DOME if indoors and not room_like else _EYES[indoors]
     sides = site.box[1] - site.box[0]
     tall = sides[2] if indoors else site.tallness
     far = 0.4 * min(sides[:2]) if indoors else 0.6 * tall
     room = max(2 * site.grid.cell, 0.06 * tall)
     at = halton(0, int(np.clip(4 * count, *_TRIES)), 3, survey.seed + shift)
     places = between(site.box, at)
-    places[:, 2] = site.ground(places) + tall * between(_EYES[indoors], at[:, 2])
+    places[:, 2] = site.ground(places) + tall * between(heights, at[:, 2])
     places = places[site.is_free(places, room / site.grid.cell)]
     if indoors:
         places = places[closed(site, places, 64, -1.0, 0.5) > _WALLS]
