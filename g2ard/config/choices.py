@@ -49,7 +49,7 @@ AdaptSchedule = Literal["default", "paper"]
 """Schedules of adaptation (`g2ard.pipeline.adapt`)."""
 ADAPT_SCHEDULES: tuple[AdaptSchedule, ...] = get_args(AdaptSchedule)
 
-Refinement = Literal["auto", "none", "photometric", "exact"]
+Refinement = Literal["auto", "none", "photometric"]
 """Refinements of a photo's pose after feature matching (`g2ard.stages.register`)."""
 
 Keep = Literal["registered", "uncertain", "all"]

@@ -272,22 +272,6 @@ class Renderer:
 
         return Rendered(*panorama(shown, camera, width))
 
-    def pose_gradient(self, gradient: _Floats) -> NDArray[np.float64]:
-        """Return the (6,) gradient dL/d(v, ω) of the last render's pose T, where T ← exp(v, ω)·T in the
-        camera's axes. That render must be the same thread's.
-
-        g_v = Σ W·dL/dμ and g_ω = Σ X × dL/dX + Σᵢ W·(dL/djwᵢ × jwᵢ), with X = Wμ + t, dL/dX without the view
-        dependence of colours, and jwᵢ the rows of the projection's J·W. Gaussians crossing α = 1/255
-        contribute no gradient.
-
-        Args:
-            gradient: (H, W, 3) float32 dL/d(image).
-
-        Raises:
-            InputError: no render before, or another thread's.
-        """
-        return np.array(self._rasterizer.pose_gradient(self._arrays, np.ascontiguousarray(gradient)))
-
     def _view(self, camera: Camera) -> View:
         return view_of(Cameras.of([camera]).recentred(self._offset), 0, self._settings)
 

@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 
 from g2ard import _core
-from g2ard.errors import InputError
 from g2ard.rendering.renderer import RasterSettings, Renderer, arrays_of, view_of
 from g2ard.rendering.targets import Photos, Targets, TeacherRenders
 from g2ard.scene.prepared import finite_rows_of
@@ -51,20 +50,6 @@ def test_one_renderer_renders_as_in_one_thread() -> None:
         for thread, images in enumerate(at_once(lambda t: [shared.image(VIEWS[i]) for i in in_turn(8, t)])):
             for view, image in zip(in_turn(8, thread), images, strict=True):
                 np.testing.assert_array_equal(image, alone[view])
-
-
-def test_a_pose_gradient_is_of_the_own_threads_render() -> None:
-    renderer, gradient = Renderer(BALL), np.ones((72, 96, 3), np.float32)
-    renderer.image(VIEWS[0])
-    own = renderer.pose_gradient(gradient)
-    with ThreadPoolExecutor(1) as pool:
-        with pytest.raises(InputError, match="another thread"):
-            pool.submit(renderer.pose_gradient, gradient).result()
-        pool.submit(renderer.image, VIEWS[3]).result()
-    with pytest.raises(InputError, match="another thread"):
-        renderer.pose_gradient(gradient)
-    renderer.image(VIEWS[0])
-    np.testing.assert_array_equal(renderer.pose_gradient(gradient), own)
 
 
 IMAGE_BYTES = 3 * 4 * 96 * 72

@@ -170,19 +170,17 @@ def test_images_are_drawn_on_the_gpu(settings: RasterSettings, offset: float, gp
 
 
 def test_what_the_gpu_does_not_draw_is_the_cpus(gpu: None) -> None:
-    """Depths, panoramas and gradients, also after an image of the GPU's, and INRIA's convention."""
+    """Depths and panoramas, also after an image of the GPU's, and INRIA's convention."""
     ball, view = checkered_ball(500), around(1, (48, 40))[0]
-    gradient = np.ones((40, 48, 3), np.float32)
     made = []
     for device in ("cpu", "gpu"):
         devices.use(device)
         renderer, inria = Renderer(ball), Renderer(ball, settings=RasterSettings(convention="inria"))
         around_it = renderer.panorama(view, width=32).image
         renderer.image(view)
-        slope = renderer.pose_gradient(gradient)
         rendered = renderer.render(view, median=True)
         made.append(
-            [around_it, slope, rendered.image, rendered.depth, rendered.median, inria.image(view)],
+            [around_it, rendered.image, rendered.depth, rendered.median, inria.image(view)],
         )
     assert served() == 1
     for here, there in zip(*made, strict=True):

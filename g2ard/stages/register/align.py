@@ -25,7 +25,7 @@ from g2ard.stages.register.pose import Float, moved
 
 Mask = NDArray[np.bool_]
 
-TUKEY = 4.685
+_TUKEY = 4.685
 """Tukey's constant, as in the normal equations' weights."""
 _DAMPING = 1e-6
 """Relative damping added to the diagonal of the normal equations."""
@@ -292,7 +292,7 @@ def with_prior(normal: Normal, pixels: int, zoom: float, sigma: float, config: R
     matrix, right = normal.matrix.copy(), normal.right.copy()
     matrix[6, 6] += weight
     right[6] -= weight * zoom
-    penalty = 3 * config.correlated * (zoom / sigma / TUKEY) ** 2 / pixels
+    penalty = 3 * config.correlated * (zoom / sigma / _TUKEY) ** 2 / pixels
     return replace(normal, matrix=matrix, right=right, cost=normal.cost + penalty)
 
 

@@ -14,7 +14,6 @@ from g2ard.stages.register.align import Aligned, Level, align, inverse, level_of
 from g2ard.stages.register.config import RegisterConfig
 from g2ard.stages.register.grey import band_passed, grey_of, local_zncc, shift_between
 from g2ard.stages.register.matchers import Matcher, Sift, sift_or_none
-from g2ard.stages.register.polish import polish
 from g2ard.stages.register.pose import Float, motion_between, moved, pose_error, rotation_of
 from g2ard.stages.register.repeats import decisive, look, preference, repeated_poses, softened
 from g2ard.stages.register.solve import Solved, solve
@@ -183,8 +182,6 @@ class Search:
     def by_alignment(self, start: Start, photo: Photo) -> Candidate | None:
         """Align directly, coarse to fine; return None if the start does not see the scene."""
         aligned = self._aligned(start.begins, photo.pyramid)
-        if aligned is not None and self.config.refine == "exact":
-            aligned = self._polished(aligned, photo, None)
         return None if aligned is None else Candidate(start, aligned, self._likeness(aligned, photo))
 
     def by_features(self, start: Start, photo: Photo) -> Candidate | None:
@@ -269,7 +266,7 @@ class Search:
 
         "none" keeps it. "photometric" aligns from it. "auto" takes the mean of both weighted by their
         information: ξ = (Λ_f + Λ_p)⁻¹ (Λ_p ξ_p − Λ_0 ξ_0), with ξ_p the motion from the first to the second,
-        Λ_0 and ξ_0 the prior of the focal length, which Λ_p has too. "exact" polishes that mean.
+        Λ_0 and ξ_0 the prior of the focal length, which Λ_p has too.
         """
         refine, focal_sigma = self.config.refine, solved.focal_sigma
         near = self._aligned(solved.viewmat, photo.pyramid[-_REFINING_LEVELS:], solved.zoom, focal_sigma)
@@ -289,7 +286,7 @@ class Search:
                 depth=solved.depth,
                 zoom=solved.zoom,
             )
-        if refine in ("auto", "exact") and near.covariance is not None:
+        if refine == "auto" and near.covariance is not None:
             of_light = inverse(near.covariance)
             both = None if of_light is None else inverse(solved.information + of_light)
             if of_light is not None and both is not None:
@@ -301,17 +298,7 @@ class Search:
                     covariance=both,
                     zoom=solved.zoom * float(np.exp(step[6])),
                 )
-        if refine == "exact":
-            refined = self._polished(refined, photo, solved)
         return Candidate(start, refined, self._likeness(refined, photo), solved)
-
-    def _polished(self, start: Aligned, photo: Photo, prior: Solved | None) -> Aligned:
-        """Polish by the exact gradient at the finest level; return the start if that fails."""
-        camera, level = photo.pyramid[-1]
-        camera = zoomed(camera, start.zoom, camera.viewmat)
-        polished = polish(self.renderer, start, camera, level, prior, self.config)
-        self.renders += 1 if polished is None else polished.steps
-        return start if polished is None else polished
 
     def _aligned(
         self,

@@ -21,7 +21,7 @@ ROUGH_FOCAL_SIGMA = 0.015
 TAIL = 2.0
 """Factor on `focal_sigma` in covariances, because a minority of focal lengths is far off."""
 
-_FEATURE_FIELDS = ("passes", "features", "ratio", "max_reprojection", "min_inliers", "alike")
+_FEATURE_FIELDS = ("passes", "features", "ratio", "max_reprojection", "min_inliers", "alike", "refine")
 
 
 @dataclass(frozen=True)
@@ -34,8 +34,7 @@ class RegisterConfig(Settings):
         matcher: "auto" (SIFT if the extra `register` is installed, otherwise direct), "sift", "direct", or
             "MODULE:FUNCTION".
         refine: refinement after features: "none" keeps their pose, "photometric" aligns from it, "auto"
-            combines both, "exact" polishes the result (or alignment's) by the exact gradient of renders
-            (`g2ard.stages.register.polish`).
+            combines both.
         passes: maximum number of passes of rendering, matching and solving.
         coarsest: approximate longer side in pixels of the coarsest alignment level; each level doubles it.
         iterations: maximum iterations per level.
@@ -96,8 +95,6 @@ class RegisterConfig(Settings):
         super().__post_init__()
         if self.matcher == "direct":
             unused = [n for n in _FEATURE_FIELDS if getattr(self, n) != getattr(RegisterConfig, n)]
-            if self.refine in ("none", "photometric"):
-                unused.append("refine")
             if unused:
                 raise InputError("has no effect on the matcher direct", parameter=unused[0])
         require("window", self.window, self.window % 2 == 1, "an odd number")

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from g2ard import _core
 from g2ard.stages.register.pose import Float
 
-LUMA = np.array([0.299, 0.587, 0.114])
+_LUMA = np.array([0.299, 0.587, 0.114])
 
 _BAND_WINDOW = 9
 """Side in pixels of the window whose mean `band_passed` subtracts."""
@@ -17,7 +17,7 @@ _BAND_WINDOW = 9
 def grey_of(image: NDArray[Any]) -> Float:
     """Return the (H, W) float64 luma of an (H, W, 3) image, .299 R + .587 G + .114 B."""
     rgb = np.asarray(image, np.float64)
-    return rgb[..., 0] * LUMA[0] + rgb[..., 1] * LUMA[1] + rgb[..., 2] * LUMA[2]
+    return rgb[..., 0] * _LUMA[0] + rgb[..., 1] * _LUMA[1] + rgb[..., 2] * _LUMA[2]
 
 
 def blurred(image: Float) -> Float:
@@ -28,20 +28,6 @@ def blurred(image: Float) -> Float:
         a, b, c, d, e = (pad.take(np.arange(k, k + n), axis) for k in range(5))
         image = ((a + e) + 4 * (b + d) + 6 * c) / 16
     return image
-
-
-def blurred_back(slope: Float) -> Float:
-    """Return dL/d(image) from dL/d(`blurred`), each (H, W): the transpose of the blur."""
-    for axis in (0, 1):
-        slope = np.moveaxis(slope, axis, 0)
-        n = len(slope)
-        wide = np.zeros((n + 4, *slope.shape[1:]))
-        for k, tap in enumerate((1, 4, 6, 4, 1)):
-            wide[k : k + n] += tap / 16 * slope
-        wide[2] += wide[0] + wide[1]
-        wide[n + 1] += wide[n + 2] + wide[n + 3]
-        slope = np.moveaxis(wide[2 : n + 2], 0, axis)
-    return slope
 
 
 def gradient(image: Float) -> tuple[Float, Float]:
