@@ -2,16 +2,23 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
+from itertools import accumulate
 from typing import Any, Self
 
 import msgspec
 
+from g2ard.progress import plural
+from g2ard.system.shown import Shown
+
 LEFT_OUT = {"left_out": True}
 """Metadata of an optional field that JSON omits without a value."""
 
+_LINE, _VALUE, _ROW = 90, 40, 120
+"""Most characters of a report in one line, of a value in it, and of a value in a row of its own."""
+
 
 @dataclass(frozen=True)
-class Report:
+class Report(Shown):
     """A dataclass of numbers, strings, lists of these, and nested reports.
 
     >>> from dataclasses import field
@@ -23,6 +30,24 @@ class Report:
     >>> Pair(1.0, 2.0).as_dict(), Pair.of({"before": 1.0, "after": 2.0}) == Pair(1.0, 2.0)
     ({'before': 1.0, 'after': 2.0}, True)
     """
+
+    def __init_subclass__(cls) -> None:
+        if "__repr__" not in cls.__dict__:  # `dataclass` would write one that spells out nested reports
+            cls.__repr__ = Report.__repr__  # type: ignore[method-assign]
+
+    def __repr__(self) -> str:
+        told = [f"{name}={_brief(value, _VALUE)}" for name, value in self._values()]
+        ends = accumulate(len(text) + 2 for text in told)
+        fitting = [text for text, end in zip(told, ends, strict=True) if end <= _LINE]
+        return f"{type(self).__name__}({', '.join(fitting + ['…'] * (len(fitting) < len(told)))})"
+
+    def rows(self) -> list[tuple[str, str]]:
+        """Return the names of fields with a value, and that in at most a line."""
+        return [(name, _brief(value, _ROW)) for name, value in self._values()]
+
+    def _values(self) -> list[tuple[str, Any]]:
+        values = [(f.name, getattr(self, f.name)) for f in fields(self)]
+        return [(name, value) for name, value in values if value is not None]
 
     def as_dict(self) -> dict[str, Any]:
         """Return the report as JSON values: fields by name, nested reports as dicts."""
@@ -46,3 +71,13 @@ def _nested(value: Any) -> Any:
     if isinstance(value, Report):
         return value.as_dict()
     return [_nested(item) for item in value] if isinstance(value, list | tuple) else value
+
+
+def _brief(value: Any, most: int) -> str:
+    """Return a value in at most `most` characters, collections by their length if they need more."""
+    text = f"{value:.6g}" if isinstance(value, float) else repr(value)
+    if len(text) <= most:
+        return text
+    if isinstance(value, Report):
+        return f"{type(value).__name__}(…)"
+    return plural(len(value), "item") if isinstance(value, list | tuple | dict) else f"{text[: most - 1]}…"

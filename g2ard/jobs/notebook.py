@@ -17,6 +17,7 @@ from g2ard.config.choices import Colour
 from g2ard.errors import InputError
 from g2ard.io import Source
 from g2ard.io.images import load_photo, png_bytes, resized
+from g2ard.io.reports import Report
 from g2ard.jobs.comparison import made_of_points
 from g2ard.jobs.inputs import GivenViews, Views, load_scene
 from g2ard.jobs.viewer_frame import backdrop, frame_of
@@ -108,7 +109,7 @@ def view(
 
 
 def html_of(shown: Any) -> str:
-    """Return what a notebook shows of a scene, a view, targets or a result: its line and a picture."""
+    """Return what a notebook shows: a line, and of a report its values, otherwise a picture."""
     try:
         picture = _picture(shown)
     except InputError as error:  # nothing visible, or a photo that moved
@@ -117,6 +118,9 @@ def html_of(shown: Any) -> str:
 
 
 def _picture(shown: Any) -> str:
+    if isinstance(shown, Report):
+        rows = (f"<tr><td>{name}</td><td>{escape(text)}</td></tr>" for name, text in shown.rows())
+        return f"<table>{''.join(rows)}</table>"
     if isinstance(shown, Camera):
         if shown.image_path is None:
             return _wedge(shown)

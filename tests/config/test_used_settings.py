@@ -205,7 +205,7 @@ def _registered(settings: Mapping[str, Any]) -> object:
     named = {f"register.{name}": value for name, value in settings.items()}
     pool = around(6, (160, 120), 2.8)
     done = g2ard.register(scene, photos, poses=start, pool=pool, settings=named, keep="all").report
-    return [repr(replace(photo, seconds=0.0)) for photo in done.photos]
+    return [repr(vars(replace(photo, seconds=0.0))) for photo in done.photos]
 
 
 DISTILL: dict[str, Any] = {

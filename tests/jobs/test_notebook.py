@@ -5,8 +5,9 @@ import base64
 import re
 import sys
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import fields, replace
 from html import unescape
+from importlib import import_module
 from io import BytesIO
 from pathlib import Path
 from types import SimpleNamespace
@@ -19,6 +20,7 @@ from PIL import Image
 import g2ard
 from g2ard.errors import InputError
 from g2ard.io.images import load_photo
+from g2ard.io.reports import Report
 from g2ard.rendering.targets import fingerprint_of
 from g2ard.scene.lenses import PhotoLens
 from helpers.project import ROOT
@@ -39,6 +41,10 @@ def results() -> dict[str, Any]:
         "TeacherRenders": g2ard.TeacherRenders(BALL, VIEWS),
         "Camera": VIEWS[0],
         "Recovered": g2ard.recover(BALL, done.held_out, steps=2),
+        "DistillReport": done.report,
+        "SimplifyReport": done.report.rounds[0].simplify,
+        "RecoverReport": done.report.rounds[0].recover[0],
+        "Evaluation": done.scores,
     }
 
 
@@ -63,8 +69,28 @@ def test_results_show_a_line_and_a_picture(results: dict[str, Any]) -> None:
         assert "\n" not in line
         assert len(line) < 120
         assert line in unescape(html)
-        if name != "Camera":
+        if isinstance(shown, Report):
+            assert re.findall(r"<tr><td>(\w+)</td><td>[^<]{1,120}</td></tr>", html) == [
+                field for field, value in vars(shown).items() if value is not None
+            ]
+        elif name != "Camera":
             assert embedded(html).std() > 5, name  # the ball, not an empty picture
+
+
+def test_every_report_is_a_line() -> None:
+    for path in (ROOT / "g2ard").rglob("*.py"):
+        if "(Report):" in path.read_text(encoding="utf-8"):
+            import_module(".".join(path.relative_to(ROOT).with_suffix("").parts))
+    reports = [cls for cls in Report.__subclasses__() if cls.__module__.startswith("g2ard.")]
+    own = {cls.__name__ for cls in reports if cls.__repr__ is not Report.__repr__}
+    assert own == {"Evaluation", "RecoverReport"}
+    for cls in reports:
+        full = cls.__new__(cls)
+        for field in fields(cls):
+            object.__setattr__(full, field.name, ["word"] * 500)
+        if cls.__name__ not in own:
+            assert re.fullmatch(cls.__name__ + r"\(\w+=500 items(, \w+=500 items)*(, …)?\)", repr(full))
+            assert len(repr(full)) < 120
 
 
 def test_a_camera_shows_its_photo_or_its_frame(tmp_path: Path) -> None:
