@@ -23,6 +23,7 @@ from g2ard.scene.cameras import Cameras
 from g2ard.scene.regions import sky_mask
 from g2ard.scene.splats import SH_C0, Splats, check_finite
 from g2ard.stages.clean import FLOATING, KINDS, Cleaning, compare_depths, find_clutter
+from g2ard.system.shown import Shown
 
 CLUTTER_VIEWS, CLUTTER_SIDE = 96, 400
 """Number of generated views for finding clutter, and their longer side in pixels."""
@@ -37,7 +38,7 @@ _SCENE_BRIGHTNESS_SHARE = 0.45
 
 
 @dataclass(frozen=True, eq=False)
-class Cleaned:
+class Cleaned(Shown):
     """Scene with its clutter marked.
 
     Args:

@@ -37,6 +37,7 @@ from g2ard.report.labels import names_of
 from g2ard.scene.regions import sky_mask
 from g2ard.scene.samples import evenly_spaced
 from g2ard.scene.splats import Splats
+from g2ard.system.shown import Shown
 from g2ard.viewer.page import Start, write_globe_page, write_stream_page
 
 if TYPE_CHECKING:
@@ -85,7 +86,7 @@ L = TypeVar("L", Splats, TileStore)
 
 
 @dataclass(frozen=True, eq=False)
-class Levels(Generic[L]):
+class Levels(Shown, Generic[L]):
     """Levels of detail of a scene, finest first, with a report on each, and the sky if it is apart."""
 
     splats: tuple[L, ...]

@@ -127,9 +127,10 @@ def _picture(shown: Any) -> str:
         return _embedded(_small(load_photo(Cameras.of([shown]), 0)[0]))
     if isinstance(shown, Cameras):
         return " ".join(_picture(shown[int(view)]) for view in evenly_spaced(len(shown), _TARGETS))
-    if hasattr(shown, "cameras"):
+    held = getattr(shown, "splats", None)
+    if held is None and hasattr(shown, "cameras"):
         return _embedded(_row(shown))
-    scene = scene_of(shown)
+    scene = scene_of(held[0] if isinstance(held, tuple) else shown)  # the finest of levels
     view = best_views(scene, size=_SIZE)[0]
     drawn = Renderer(scene).render(view)
     lifted = backdrop(None, [scene]) is None

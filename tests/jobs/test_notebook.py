@@ -2,6 +2,7 @@
 
 import ast
 import base64
+import inspect
 import re
 import sys
 from collections.abc import Callable
@@ -10,7 +11,7 @@ from html import unescape
 from importlib import import_module
 from io import BytesIO
 from pathlib import Path
-from types import SimpleNamespace
+from types import FunctionType, SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -23,6 +24,7 @@ from g2ard.io.images import load_photo
 from g2ard.io.reports import Report
 from g2ard.rendering.targets import fingerprint_of
 from g2ard.scene.lenses import PhotoLens
+from g2ard.stages.clean import Cleaning
 from helpers.project import ROOT
 from helpers.scenes import around, checkered_ball
 from helpers.view_files import photo as photo_file
@@ -41,6 +43,9 @@ def results() -> dict[str, Any]:
         "TeacherRenders": g2ard.TeacherRenders(BALL, VIEWS),
         "Camera": VIEWS[0],
         "Recovered": g2ard.recover(BALL, done.held_out, steps=2),
+        "Adapted": g2ard.adapt(BALL, done.held_out),
+        "Cleaned": g2ard.clean(BALL),
+        "Levels": g2ard.lod(BALL, ratios=(1, 2), recover=False, views=VIEWS),
         "DistillReport": done.report,
         "SimplifyReport": done.report.rounds[0].simplify,
         "RecoverReport": done.report.rounds[0].recover[0],
@@ -77,6 +82,19 @@ def test_results_show_a_line_and_a_picture(results: dict[str, Any]) -> None:
             assert embedded(html).std() > 5, name  # the ball, not an empty picture
 
 
+def test_all_results_with_a_scene_are_among_those_shown(results: dict[str, Any]) -> None:
+    holding = set()
+    for name in g2ard.__all__:
+        public = getattr(g2ard, name)
+        if isinstance(public, FunctionType):
+            (returned,) = re.findall(r"^\w+", str(inspect.signature(public).return_annotation))
+            cls = getattr(sys.modules[public.__module__], returned, None)
+            if hasattr(cls, "splats") or "splats" in getattr(cls, "__dataclass_fields__", ()):
+                holding.add(returned)
+    assert len(holding) > 4
+    assert holding <= set(results)
+
+
 def test_every_report_is_a_line() -> None:
     for path in (ROOT / "g2ard").rglob("*.py"):
         if "(Report):" in path.read_text(encoding="utf-8"):
@@ -109,8 +127,10 @@ def test_a_camera_shows_its_photo_or_its_frame(tmp_path: Path) -> None:
 
 def test_a_scene_without_anything_to_see_is_a_line() -> None:
     clear = replace(BALL, logit_opacities=np.full(len(BALL), -20, np.float32))
-    assert "<img" not in clear._repr_html_()
-    assert repr(clear) in clear._repr_html_()
+    empty = g2ard.Cleaned(BALL, Cleaning(np.zeros(len(BALL), np.int8)), None, VIEWS)
+    for shown in (clear, empty):
+        assert "<img" not in shown._repr_html_()
+        assert repr(shown) in shown._repr_html_()
 
 
 def test_rendered_images_show_as_they_are_written(tmp_path: Path) -> None:
