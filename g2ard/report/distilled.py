@@ -208,16 +208,17 @@ def distill_report(
     if files:
         scene = next(iter(files.values()))
         page.heading("What next")
-        page.code(line.format(scene) for line in _NEXT)
+        photos = not report.lifted or "photo" in report.against
+        page.code(line.format(scene) for line in [*_NEXT, *[_ADAPT] * photos])
     page.write(path)
 
 
 _NEXT = (
     "g2ard distill {} --fit 5MB --format sog -o smaller/    # a smaller file",
     "g2ard lod {} -o streamed/                              # levels of detail that a browser streams",
-    "g2ard adapt {} --views photos/ -o adapted.ply          # colours of other photos",
 )
-"""Commands for a result."""
+_ADAPT = "g2ard adapt {} --views photos/ -o adapted.ply          # colours of other photos"
+"""Commands for a result, and one for all but scans without photos."""
 
 
 def edges_line(kinds: Sequence[KindScore]) -> str | None:

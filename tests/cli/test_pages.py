@@ -211,6 +211,8 @@ def test_points_are_points(command: str, tmp_path: Path, command_line: CommandLi
     for run in tmp_path.glob("run"):
         told += succeeds(command_line, tmp_path, "info", run).out
         told += "".join(Text(page).text for page in run.glob("*.html"))
+        following = re.findall(r"g2ard (\w+) scene\.ply", Text(run / "report.html").text)
+        assert following == ["distill", "lod", *["adapt"] * ("photos" in command)]
     as_many = "→ 400 Gaussians|400 Gaussians from 400 points|result: run, 400 Gaussians"
     told = re.sub(as_many, "", told)
     assert re.search("400 points|at most 400,", told)
