@@ -25,6 +25,7 @@ from g2ard.rendering.targets import CACHE_BYTES
 from g2ard.system.threads import threads_used
 
 if TYPE_CHECKING:
+    from g2ard.io.stream import SceneStream
     from g2ard.jobs.simplify import Reduction
     from g2ard.scene.cameras import Cameras
     from g2ard.scene.splats import Splats
@@ -48,9 +49,11 @@ _TILED = {
 """Microseconds per Gaussian of stages in tiles, in order: half to two thirds of the CPU time of guitar and
 150,000 Gaussians of playbot in tiles of 30,000 and 50,000. In larger tiles, 1 to 100 million Gaussians take
 5 to 7 in all (`docs/benchmarks.md`)."""
-_CLEANING = {"visibility": (0.5, 4e-6), "depths": (0.5, 6e-6), "clutter": (0.5, 7e-6)}
-"""Seconds of the stages of `clean`, and per Gaussian: 46 in all on showroom (2,751,651). In CPU time guitar
-takes 4.7 s, playbot 17.5 and taebak_park/0_0 9.4."""
+_CLEANING = {"visibility": (0.5, 4e-6), "depths": (0.5, 6e-6), "clutter": (0.5, 0)}
+"""Seconds of the stages of `clean`, and per Gaussian: with `_GROUPING` 46 in all on showroom (2,751,651). In
+CPU time guitar takes 4.7 s, playbot 17.5 and taebak_park/0_0 9.4."""
+_GROUPING = {"needle": 3.5e-6, "floater": 3.5e-6}
+"""Seconds of `clutter` per Gaussian, by the kinds that look for neighbours: 1.1 and 1.3 on playbot."""
 _CLEANING_BYTES = 750
 """Bytes per Gaussian of `clean`; these three have 700 to 860."""
 _LIGHT = 0.0025
@@ -216,11 +219,15 @@ def cost_of_reduction(reduce: Reduction, count: int) -> Cost:
     return Cost(views, pixels, 0, tuple(stages), memory)
 
 
-def cost_of_cleaning(count: int) -> Cost:
-    """Return the cost of finding the clutter among `count` Gaussians."""
-    stages = tuple((name, fixed + each * count) for name, (fixed, each) in _CLEANING.items())
+def cost_of_cleaning(scene: SceneStream, kinds: Sequence[str]) -> Cost:
+    """Return the cost of finding some kinds of clutter in a scene, or of only reading it for none."""
+    count = scene.count
+    if not kinds:
+        return Cost(0, 0, 0, (), _PROGRAM_BYTES + int(_KEPT_TIMES * 4 * row_width(scene.sh_degree) * count))
+    seconds = {name: fixed + each * count for name, (fixed, each) in _CLEANING.items()}
+    seconds["clutter"] += sum(_GROUPING.get(kind, 0) for kind in kinds) * count
     memory = _PROGRAM_BYTES + _SURVEY[0] + _CLEANING_BYTES * count
-    return Cost(CLUTTER_VIEWS, CLUTTER_SIDE**2 * 3 // 4, 0, stages, memory)
+    return Cost(CLUTTER_VIEWS, CLUTTER_SIDE**2 * 3 // 4, 0, tuple(seconds.items()), memory)
 
 
 def _tiled_stages(plan: TilePlan, views: int, *, gaps: bool) -> list[tuple[str, float]]:

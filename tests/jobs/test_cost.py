@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -111,6 +112,7 @@ MEASURED = {
     "distil photos": "distill --views photos -n 500 --steps 12",
     "simplify": "simplify 60000_3.ply -r 10",
     "simplify without views": "simplify 60000_2.ply -r 10 --no-views",
+    "clean nothing": "clean 60000_3.ply --only none",
     "recover": "recover 20000_2.ply --teacher 60000_3.ply --views views.json --steps 4",
     "adapt": "adapt 20000_0.ply --teacher 60000_0.ply --views views.json --steps 4",
 }
@@ -180,6 +182,23 @@ def test_a_dry_run_needs_no_output(budget: str, folder: Path, command_line: Comm
         ask = ("--ratios", "1,2", *ask[2:])
         succeeds(command_line, folder, "lod", "ball.ply", *ask)
     assert set(folder.iterdir()) == before
+
+
+def test_a_dry_run_of_clean_is_of_the_kinds_requested(folder: Path, command_line: CommandLine) -> None:
+    def planned(*only: str) -> dict[str, Any]:
+        ask = ("clean", "ball.ply", *only, "--dry-run", "--json", "-")
+        told: dict[str, Any] = json.loads(succeeds(command_line, folder, *ask).out)
+        return told
+
+    nothing, giants, needles, whole = (
+        planned(*only) for only in (["--only", "none"], ["--only", "giant"], ["--only", "needle"], [])
+    )
+    assert (nothing["views"], nothing["stages"], nothing["seconds"]) == (0, [], 0)
+    assert nothing["bytes"] < giants["bytes"]
+    assert giants["views"] == whole["views"] > 0
+    assert 0 < giants["seconds"] < needles["seconds"] < whole["seconds"]
+    told = succeeds(command_line, folder, "clean", "ball.ply", "--only", "none", "--dry-run").err
+    assert "400 Gaussians: roughly 1 s" in told
 
 
 @pytest.mark.parametrize("command", ["recover", "adapt"])

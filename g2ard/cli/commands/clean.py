@@ -18,6 +18,7 @@ from g2ard.progress import plural
 
 if TYPE_CHECKING:
     from g2ard.jobs.clean import Cleaned
+    from g2ard.jobs.cost import Cost
     from g2ard.scene.cameras import Cameras
 
 _GREY = (0.45, 0.48, 0.52)
@@ -87,14 +88,15 @@ def clean(
 
     kinds = None if only is None else tuple(word.strip() for word in only.split(",") if only != "none")
     with run.usage():
-        kinds_of(kinds, strength)
+        wanted = kinds_of(kinds, strength)
     if preview is not None and kinds == ():
         raise typer.BadParameter("--preview shows clutter, so that it does not go with --only none")
     if output is None and (preview is None or split_sky is not None):
         raise typer.BadParameter("give an output with -o, or only --preview")
     source = Source(scene, run.render_model)
+    cost = cost_of_cleaning(source.scene, wanted)
     if dry_run:
-        _tell_plan(run, source.scene.count)
+        _tell_plan(run, source.scene.count, cost)
         return
     if preview is not None:
         run.claim_file("--preview", preview)
@@ -102,7 +104,7 @@ def clean(
         if path is not None:
             run.claim_scene(flag, path)
     drawn = [("preview", 1)] if preview is not None else []
-    run.console.expect([*cost_of_cleaning(source.scene.count).stages, *drawn])
+    run.console.expect([*cost.stages, *drawn])
     done = remove_clutter(
         run.load(source),
         only=kinds,
@@ -132,14 +134,12 @@ def clean(
     run.result(counts if done.sky is None else {**counts, "sky_count": sky_count})
 
 
-def _tell_plan(run: Run, count: int) -> None:
+def _tell_plan(run: Run, count: int, cost: Cost) -> None:
     """Print the rough time and memory of cleaning `count` Gaussians."""
-    from g2ard.jobs.cost import cost_of_cleaning
-
-    cost = cost_of_cleaning(count)
+    views = f", looked at in {cost.views} views" if cost.views else ""
     run.answer(
-        f"{plural(count, 'Gaussian')}, looked at in {cost.views} views: roughly {max(1, cost.seconds):.0f} s "
-        f"on two cores and {memory_of(cost)}"
+        f"{plural(count, 'Gaussian')}{views}: roughly {max(1, cost.seconds):.0f} s on two cores and "
+        f"{memory_of(cost)}"
     )
     run.say_dry()
     run.result({"count": count, **asdict(cost), "seconds": cost.seconds})
