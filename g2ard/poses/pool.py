@@ -259,7 +259,11 @@ def _more(survey: Survey, poses: Poses, reach: Reach, kind: str, count: int) -> 
         views = survey.cameras(plan_near(survey, poses, reach, count))
     else:
         wide = replace(survey, lens=Lens(survey.lens.size, WIDE))
-        found = plan_walk(wide, count, 3) if kind == "standing" else plan_anywhere(wide, count)
+        if kind == "anywhere":
+            found = plan_anywhere(wide, count)
+        else:
+            # Below a ceiling, not on it.
+            found = plan_walk(wide, count, 3, indoors=True if is_hidden(survey) else None)
         views = wide.cameras(found)
     return [replace(view, name=view.name.replace("pose", kind), kind=kind) for view in views]
 

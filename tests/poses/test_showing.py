@@ -120,8 +120,10 @@ def test_a_hall_without_a_roof_is_shown_and_seen_from_within() -> None:
 def test_a_hall_that_is_no_room_still_trains_from_within(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("g2ard.poses.site._ENCLOSED", 1.1)  # more than all directions
     pool = plan_pool(hall(plate=0.2), 16, rows=60_000)  # a ceiling that looks sharp from above
-    eyes = pool.cameras.positions
-    assert ((eyes > 0) & (eyes < SIZE)).all()
+    standing = Cameras.of(pool.more("standing", 8))
+    assert len(standing) >= 4
+    for cameras in (pool.cameras, standing):
+        assert ((cameras.positions > 0) & (cameras.positions < SIZE)).all()
     assert "ceiling" in pool.why
 
 
