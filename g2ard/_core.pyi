@@ -13,7 +13,7 @@ from g2ard.stages.lift import LiftConfig
 from g2ard.stages.recover.anchors import Regularizers
 from g2ard.stages.recover.config import Rates
 from g2ard.stages.recover.engine import Photometric
-from g2ard.stages.select.surfaces import SurfaceOptions
+from g2ard.stages.select.surfaces import CoverageOptions
 from g2ard.stages.simplify.config import SimplifyConfig
 
 __version__: str
@@ -234,7 +234,7 @@ def select_greedy(
     views: tuple[NDArray[np.uint64], NDArray[np.uint32], _F64],
     k: int,
     directional: bool,
-    config: SurfaceOptions,
+    config: CoverageOptions,
     progress: Callable[[int, int], None] | None = None,
 ) -> tuple[NDArray[np.uint32], _F64, int]: ...
 def select_light(

@@ -7,9 +7,10 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from benchmarks import baselines
+from benchmarks.policies import POLICIES
 from benchmarks.study import key
 from g2ard.config.choices import METHODS as SIMPLIFIERS
-from g2ard.config.choices import POLICIES, SCHEDULE_NAMES
+from g2ard.config.choices import SCHEDULE_NAMES
 from g2ard.errors import InputError
 from g2ard.stages.recover.anchors import REGULARIZERS
 

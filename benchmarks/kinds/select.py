@@ -13,6 +13,7 @@ from typing import Any, ClassVar, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.policies import order_views
 from benchmarks.rows import Row
 from benchmarks.runner import Cell
 from benchmarks.study import SceneSpec, Study, key
@@ -28,7 +29,7 @@ from g2ard.stages.evaluate import evaluate
 from g2ard.stages.recover.anchors import REGULARIZERS
 from g2ard.stages.recover.config import RecoverConfig
 from g2ard.stages.recover.optimize import recover
-from g2ard.stages.select import CoverageOptions, Selection, select
+from g2ard.stages.select import CoverageOptions, select
 from g2ard.stages.simplify import simplify
 
 __all__ = ["ARMS", "Pool", "Select", "Universe", "pool_of"]
@@ -95,15 +96,21 @@ class Select(Study):
         rows, weights, select_s = np.arange(len(pool.rows)), None, 0.0
         if arm != "pool":
             policy = "auto" if policy == "pool" else policy
-            if weighted or policy == "random":
-                chosen, select_s = _selected(universe, pool, k, policy, 1000 * seed + draw)
-                weights = chosen.weights if weighted else None
+            cameras = universe.shown.cameras.take(pool.rows)
+            began = time.process_time()
+            if weighted:
+                chosen = select(universe.splats, cameras, k, policy=policy)
+                rows, weights, select_s = chosen.order, chosen.weights, time.process_time() - began
+            elif policy == "random":
+                rows = order_views(universe.splats, cameras, policy, seed=1000 * seed + draw)
+                select_s = time.process_time() - began
             else:  # the order is the same for every K
                 if (kind, seed, policy) not in universe.orders:
-                    whole = _selected(universe, pool, len(pool.rows), policy, seed)
-                    universe.orders[kind, seed, policy] = whole
-                chosen, select_s = universe.orders[kind, seed, policy]
-            rows = chosen.order[:k]
+                    options = CoverageOptions(cells=_CELLS)
+                    order = order_views(universe.splats, cameras, policy, options=options)
+                    universe.orders[kind, seed, policy] = order, time.process_time() - began
+                rows, select_s = universe.orders[kind, seed, policy]
+            rows = rows[:k]
         background = universe.scene.background
         config = RecoverConfig(
             steps=self.steps[-1],
@@ -190,8 +197,8 @@ class Universe(Workspace):
     study: Select
 
     @cached_property
-    def orders(self) -> dict[tuple[str, int, str], tuple[Selection, float]]:
-        """Kind of pool, seed and policy → the selection of all candidates, and its seconds."""
+    def orders(self) -> dict[tuple[str, int, str], tuple[Rows, float]]:
+        """Kind of pool, seed and policy → the order of all candidates, and its seconds."""
         return {}
 
     @cached_property
@@ -281,14 +288,6 @@ def pool_of(universe: Universe, kind: str, seed: int) -> Pool:
     others = np.setdiff1d(free, crowded)
     few = rng.choice(others, min(len(many) // 3, len(others)), replace=False)
     return Pool(np.sort(np.concatenate([many, few])), np.sort(crowd))
-
-
-def _selected(universe: Universe, pool: Pool, k: int, policy: str, seed: int) -> tuple[Selection, float]:
-    began = time.process_time()
-    cameras = universe.shown.cameras.take(pool.rows)
-    options = CoverageOptions(cells=_CELLS)
-    chosen = select(universe.splats, cameras, k, policy=policy, seed=seed, options=options)
-    return chosen, time.process_time() - began
 
 
 def _nearer(prior: Splats, cameras: Cameras) -> Cameras:

@@ -104,13 +104,13 @@ def _reduce(job: Job) -> dict[str, Any]:
 
 
 def _select(job: Job) -> dict[str, Any]:
-    from g2ard.stages.select import select
+    from benchmarks.policies import order_views
 
     cameras = _cameras(job["views"])
-    chosen = select(io.read_splats(job["scene"]), cameras, job["k"], policy=job["policy"], seed=job["seed"])
-    kept = cameras.take(np.sort(chosen.order))  # all are training views
+    order = order_views(io.read_splats(job["scene"]), cameras, job["policy"], seed=job["seed"])[: job["k"]]
+    kept = cameras.take(np.sort(order))  # all are training views
     io.write_views(job["output"], kept, splits=["train"] * len(kept), overwrite=True)
-    return {"views": len(chosen.order)}
+    return {"views": len(order)}
 
 
 def _cameras(path: str) -> Cameras:

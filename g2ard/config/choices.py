@@ -21,7 +21,7 @@ Method = Literal["default", "fast", "paper"]
 """Methods of simplification."""
 METHODS: tuple[Method, ...] = get_args(Method)
 
-Policy = Literal["auto", "directional", "coverage", "pose-diverse", "random"]
+Policy = Literal["auto", "directional"]
 """Policies of view selection."""
 POLICIES: tuple[Policy, ...] = get_args(Policy)
 

@@ -12,13 +12,13 @@ from g2ard.config.schema import Settings
 from g2ard.errors import InputError
 from g2ard.stages.lift import LiftConfig
 from g2ard.stages.recover.config import RecoverConfig
-from g2ard.stages.select.surfaces import CoverageOptions, SurfaceOptions
+from g2ard.stages.select.surfaces import CoverageOptions
 from g2ard.stages.simplify.config import SimplifyConfig
 
 
 @dataclass(frozen=True)
 class SelectConfig(Settings, tag="policy"):
-    """Settings for selecting and weighting training views; `directional` and `coverage` have more.
+    """Settings for selecting and weighting training views; `directional` has more.
 
     Args:
         policy: selection policy, see `g2ard.stages.select.select`.
@@ -46,11 +46,6 @@ class SelectConfig(Settings, tag="policy"):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.views_count == "auto" and self.policy == "random":
-            raise InputError(
-                f"policy {self.policy} does not measure gains; pass a count instead of auto",
-                parameter="views_count",
-            )
         if self.focus in (None, "far") and self.focus_share != SelectConfig.focus_share:
             raise InputError("has no effect without focus", parameter="focus_share")
 
@@ -65,15 +60,8 @@ class SelectConfig(Settings, tag="policy"):
 
 
 @dataclass(frozen=True)
-class Poses(SelectConfig, variants=("auto", "pose-diverse", "random")):
-    """Settings of policies that need no surface: those of `SelectConfig`."""
-
-
-@dataclass(frozen=True)
-class Coverage(SurfaceOptions, SelectConfig, variants=("coverage",)):
-    """Settings of the policy `coverage`: those of `SurfaceOptions`."""
-
-    policy: Literal["coverage"] = "coverage"
+class Poses(SelectConfig, variants=("auto",)):
+    """Settings of the policy `auto`, which needs no surface: those of `SelectConfig`."""
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,7 @@ from g2ard.stages.evaluate import Evaluation
 from g2ard.stages.recover.config import RecoverConfig
 from g2ard.stages.recover.loop import checked_weights
 from g2ard.stages.recover.optimize import Watch
-from g2ard.stages.select import SurfaceOptions, select
+from g2ard.stages.select import CoverageOptions, select
 from g2ard.stages.simplify.reduce import SimplifyReport
 from g2ard.system.shown import Shown
 
@@ -227,8 +227,7 @@ def selected(
         cameras,
         how.count_of(len(cameras)),
         policy=policy,
-        seed=config.recover.seed,
-        options=how if isinstance(how, SurfaceOptions) else None,
+        options=how if isinstance(how, CoverageOptions) else None,
         progress=progress,
     )
     order = np.argsort(chosen.order)

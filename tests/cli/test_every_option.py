@@ -109,7 +109,7 @@ OVER_PAPER = [
     ("simplify", "method"),
     ("recover", "steps"),
     ("adapt", "steps"),
-    ("select", "policy"),
+    ("select", "k"),
 ]
 """Command and option that the paper's preset sets, so that the option must win; others it leaves alone."""
 CASES = [(command, name, "") for command, table in VALUES.items() for name in table] + [

@@ -214,7 +214,7 @@ DISTILL: dict[str, Any] = {
     **{f"lift.{name}": value for name, value in LIFT.items()},
     **{f"select.{name}": value for name, value in SELECT.items()},
     "select.views_count": 5,
-    "select.policy": "coverage",
+    "select.policy": "directional",
     "select.weighted": False,
     "select.reselect": True,
     "select.focus": "near",
@@ -330,7 +330,7 @@ def test_a_setting_changes_the_result_or_is_refused(run: str, setting: str) -> N
 @pytest.mark.parametrize(
     ("settings", "words"),
     [
-        ({"policy": "coverage"}, "select.policy: has no effect without views_count"),
+        ({"policy": "directional"}, "select.policy: has no effect without views_count"),
         ({"pixel_scale": 2.0}, "simplify.pixel_scale: has no effect with views"),
     ],
 )

@@ -223,7 +223,7 @@ VALUES: dict[str, dict[str, str]] = {
     "select": {
         **_common("format views images preset"),
         "k": "5",
-        "policy": "coverage",
+        "policy": "directional",
         "split": "all",
     },
     "render": {

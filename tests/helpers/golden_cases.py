@@ -55,7 +55,9 @@ CALLS: dict[str, Callable[[Any], Any]] = {
     "simplify-config": lambda g: g.simplify(
         "in/ball.ply", ratio=5, config=g.preset("paper", g.SimplifyConfig())
     ),
-    "select": lambda g: g.select(g.load("in/ball.ply"), g.load_views("in/views.json"), 5, policy="coverage"),
+    "select": lambda g: g.select(
+        g.load("in/ball.ply"), g.load_views("in/views.json"), 5, policy="directional"
+    ),
     "recover": lambda g: g.recover(g.load("in/small.ply"), _targets(g), steps=9, seed=2),
     "recover-paths": lambda g: g.recover(
         "in/small.ply", views="in/photos", photos=True, preset="lift", settings={"steps": 9, "sh_degree": 0}

@@ -72,10 +72,10 @@ def test_preset_paper_sets_every_stage_of_distill(folder: Path, command_line: Co
 
 
 def test_explicit_options_override_the_preset(folder: Path, command_line: CommandLine) -> None:
-    (folder / "c.toml").write_text('[distill]\nmethod = "default"\n[distill.set]\npolicy = "pose-diverse"\n')
+    (folder / "c.toml").write_text('[distill]\nmethod = "default"\n[distill.set]\npolicy = "auto"\n')
     said = ("--config", "c.toml", "--method", "fast", "--set", "views_count=4", "--set", "anchor=0.3")
     report = run(command_line, folder, *SHORT, "--preset", "paper", *said, "--set", "sh_degree=1")
-    assert (report["views"]["policy"], len(report["views"]["chosen"])) == ("pose-diverse", 4)
+    assert (report["views"]["policy"], len(report["views"]["chosen"])) == ("auto", 4)
     settings = report["settings"]
     assert (settings["simplify.method"], settings["recover.schedule.guarded"]) == ("fast", False)
     assert settings["recover.regularizers.anchor"] == 0.3

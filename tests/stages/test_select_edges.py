@@ -18,7 +18,6 @@ from helpers.commands import CommandLine, refused, succeeds
 from helpers.scenes import around, checkered_ball, views_at
 
 OPTIONS = CoverageOptions(cells=500)
-MEASURING = [p for p in POLICIES if p != "random"]
 BALL = checkered_ball(800)
 
 
@@ -27,20 +26,19 @@ def balls(count: int) -> Splats:
     return join([replace(BALL, means=BALL.means + np.float32([50 * i, 0, 0])) for i in range(count)])
 
 
-@pytest.mark.parametrize("policy", MEASURING)
+@pytest.mark.parametrize("policy", POLICIES)
 def test_views_without_overlap_are_worth_the_same(policy: str) -> None:
     scene = balls(4)
     pool = views_at([look_at([50 * i, -4, 0], [50 * i, 0, 0]) for i in range(4)])
     chosen = select(scene, pool, 4, policy=policy, options=OPTIONS)
     assert sorted(chosen.order.tolist()) == [0, 1, 2, 3]
-    if policy != "pose-diverse":  # its gains are distances
-        np.testing.assert_allclose(chosen.gains, 0.25, atol=0.02)
-        np.testing.assert_allclose(chosen.weights, 1, atol=0.02)
-        assert len(select(scene, pool, "auto", policy=policy, options=OPTIONS).order) == 4
+    np.testing.assert_allclose(chosen.gains, 0.25, atol=0.02)
+    np.testing.assert_allclose(chosen.weights, 1, atol=0.02)
+    assert len(select(scene, pool, "auto", policy=policy, options=OPTIONS).order) == 4
     assert chosen.curve[-1] == pytest.approx(1)
 
 
-@pytest.mark.parametrize("policy", MEASURING)
+@pytest.mark.parametrize("policy", POLICIES)
 def test_duplicate_poses_are_chosen_last(policy: str) -> None:
     places = around(5).viewmats
     pool = views_at([places[i] for i in (0, 0, 0, 1, 1, 2, 3, 4, 4, 4)])

@@ -211,7 +211,7 @@ def test_threads_share_a_renderer_on_the_gpu(gpu: None) -> None:
 COMMANDS = {
     "simplify a.ply -n 100 --views v.json -o out.ply": 1,
     "simplify a.ply -r 10 --method paper -o out.ply": 11,
-    "select a.ply --views v.json -k 3 --policy coverage --set cells=300 -o out.json": 1,
+    "select a.ply --views v.json -k 3 --policy directional --set cells=300 -o out.json": 1,
     "render a.ply --views v.json -o out": 1,
     "evaluate b.ply --views v.json --teacher a.ply --split all": 1,
     "compare a.ply b.ply --views v.json": 1,

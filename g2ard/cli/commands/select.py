@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     settings="g2ard.pipeline.config:SelectConfig",
     fields=("select.policy",),
     scenes=True,
+    without=("seed",),
 )
 def select(
     run: Run,
@@ -53,7 +54,7 @@ def select(
     from g2ard.jobs.inputs import load_split_views
     from g2ard.jobs.view_checks import warn_of_sight
     from g2ard.pipeline.config import SelectConfig
-    from g2ard.stages.select import SurfaceOptions
+    from g2ard.stages.select import CoverageOptions
     from g2ard.stages.select import select as choose
 
     settings = run.settled(SelectConfig(), preset)[0]
@@ -75,8 +76,7 @@ def select(
         cameras,
         config.count_of(len(cameras)),
         policy=config.policy,
-        seed=run.seed,
-        options=config if isinstance(config, SurfaceOptions) else None,
+        options=config if isinstance(config, CoverageOptions) else None,
         progress=run.progress,
     )
     run.begin("write")

@@ -15,14 +15,12 @@ from g2ard.progress import Progress, plural, silent
 from g2ard.scene.cameras import Cameras, unseeing
 from g2ard.scene.splats import Splats
 from g2ard.stages.select import poses
-from g2ard.stages.select.surfaces import Float, Order, SurfaceOptions, greedy, surface
+from g2ard.stages.select.surfaces import CoverageOptions, Float, Order, greedy
 
 _LEAST_CURVE_BEND = 0.02
 """Height above its chord below which a curve counts as straight, so that no K stands out."""
 _LARGEST_VIEW_SIDE = 32_768
 """Largest side of a view in pixels that the rasteriser accepts."""
-_COARSE_CELLS = 20_000
-"""Number of surface cells when only depths matter."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,8 +61,7 @@ def select(
     k: int | Literal["auto"],
     *,
     policy: str = "auto",
-    seed: int = 0,
-    options: SurfaceOptions | None = None,
+    options: CoverageOptions | None = None,
     progress: Progress = silent,
 ) -> Selection:
     """Choose `k` of the candidate views.
@@ -76,10 +73,8 @@ def select(
             at the K farthest above its chord; all, if the curve is straight.
         policy: one of `POLICIES`. "auto" uses poses only: farthest pose first until all are within reach,
             then facility location Σ_u w_u max_{v∈S} exp(−(d_uv/0.35)²) with crowded poses weighted less.
-            "directional" is the paper's. "coverage" counts visible cells. "pose-diverse" takes the farthest
-            pose next. "random" measures nothing.
-        seed: seed of "random".
-        options: options of "directional" and "coverage".
+            "directional" is the paper's.
+        options: options of "directional".
         progress: called with the number of views rasterised.
 
     Returns:
@@ -96,33 +91,23 @@ def select(
     >>> select(ball, views, 2).order.tolist()
     [1, 3]
     """
-    _check(cameras, k, policy, seed)
+    _check(cameras, k, policy)
     began = time.perf_counter()
     seconds: dict[str, float] = {}
     progress("select", 0, 0)
-    coarse = surface(splats, min(_COARSE_CELLS, max(1, len(splats))))
-    depths, shares = poses.outlooks(coarse, cameras)
-    alike = poses.pose_kernel(cameras, depths)
-    pose_weights = poses.inverse_density(alike)
-    usable = (depths > 0) & ~poses.inside_geometry(splats, cameras, depths, progress)
-    if not usable.any():
-        raise InputError(unseeing(cameras, "the scene"))
+    candidates = poses.measure_candidates(splats, cameras, progress)
+    alike, usable = candidates.alike, candidates.usable
     seconds["poses"] = time.perf_counter() - began
     evaluations, refused = 0, ~usable
-    if policy in ("directional", "coverage"):
+    if policy == "directional":
         rows = np.flatnonzero(usable)
-        order, gains, evaluations = greedy(splats, cameras.take(rows), policy, options, progress, seconds)
+        order, gains, evaluations = greedy(splats, cameras.take(rows), options, progress, seconds)
         order = rows[order]
         refused = ~np.isin(np.arange(len(cameras)), order)  # also views that see no cell, which greedy drops
-    elif policy == "pose-diverse":
-        order, gains = poses.farthest(alike, usable)
-    elif policy == "auto":
-        of_usable = np.where(usable, pose_weights, 0.0)
-        order = poses.facility_location(alike, of_usable, usable, shares)
-        gains = poses.gains_of(order, alike, of_usable)
     else:
-        order = np.random.default_rng([seed, 7]).permutation(np.flatnonzero(usable))
-        gains = poses.gains_of(order, alike, pose_weights)
+        of_usable = np.where(usable, candidates.weights, 0.0)
+        order = poses.facility_location(alike, of_usable, usable, candidates.shares)
+        gains = poses.gains_of(order, alike, of_usable)
     if not len(order):
         raise InputError(unseeing(cameras, "a cell of the surface"))
     count = _knee(gains) if k == "auto" else min(k, len(order))
@@ -132,7 +117,7 @@ def select(
         policy=policy,
         order=order[:count],
         gains=share[:count],
-        weights=poses.draw_weights(order[:count], alike, pose_weights),
+        weights=poses.draw_weights(order[:count], alike, candidates.weights),
         left_out=float(share[count:].sum()),
         curve=np.cumsum(share),
         refused=np.flatnonzero(refused),
@@ -141,12 +126,9 @@ def select(
     )
 
 
-def _check(cameras: Cameras, k: int | Literal["auto"], policy: str, seed: int) -> None:
-    """Reject an invalid number or seed, an unknown policy, and candidates that are missing or too large."""
+def _check(cameras: Cameras, k: int | Literal["auto"], policy: str) -> None:
+    """Reject an invalid number, an unknown policy, and candidates that are missing or too large."""
     require("policy", repr(policy), policy in POLICIES, ", ".join(POLICIES))
-    if k == "auto" and policy == "random":
-        raise InputError(f"'auto' needs a policy that measures gains, got {policy!r}", parameter="k")
-    require("seed", seed, seed >= 0, "a whole number of at least 0")
     require("k", k, k == "auto" or k >= 1, "at least 1 view")
     if not len(cameras):
         raise InputError("no candidate views to select from")

@@ -1,15 +1,16 @@
 """View selection by poses: a kernel between poses, representatives, and sampling weights."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from g2ard import _core
-from g2ard.progress import Progress, counter
-from g2ard.scene.cameras import Cameras
+from g2ard.errors import InputError
+from g2ard.progress import Progress, counter, silent
+from g2ard.scene.cameras import Cameras, unseeing
 from g2ard.scene.splats import Splats
-from g2ard.stages.select.surfaces import Float, Order, Surface, core_scene, core_views
+from g2ard.stages.select.surfaces import Float, Order, Surface, core_scene, core_views, surface
 
 _KERNEL_BANDWIDTH = 0.35
 """Bandwidth of the kernel exp(−(d/0.35)²): neighbours 20° apart on an orbit have similarity ½."""
@@ -17,6 +18,8 @@ _KERNEL_REACH = 2.0
 """Distance in bandwidths within which a chosen view represents a pose; beyond, the kernel is below 2 %."""
 _SCENE_SHARE_EXPONENT = 0.25
 """Exponent of a view's share of the scene in the weight of its gain."""
+_COARSE_CELLS = 20_000
+"""Number of surface cells when only depths matter."""
 _DEPTH_GRID = 48, 36
 _HIDDEN_DEPTH_RATIO = 1.15
 """A point farther than this multiple of the nearest depth in its grid cell is hidden."""
@@ -27,6 +30,38 @@ _INSIDE_RENDER_SIDE = 48
 """Longer side in pixels of the renders for that."""
 _INSIDE_DEPTH_SHARE = 0.02
 """A pose is inside geometry if most of its image is nearer than this share of the median depth."""
+
+
+@dataclass(frozen=True, eq=False)
+class Candidates:
+    """Poses of C candidate views.
+
+    Args:
+        alike: (C, C) from `pose_kernel`.
+        weights: (C,) from `inverse_density`.
+        shares: (C,) from `outlooks`.
+        usable: (C,) mask of views that see the scene and are not inside geometry.
+    """
+
+    alike: Float
+    weights: Float
+    shares: Float
+    usable: NDArray[np.bool_]
+
+
+def measure_candidates(splats: Splats, cameras: Cameras, progress: Progress = silent) -> Candidates:
+    """Compare the poses of views of a scene.
+
+    Raises:
+        InputError: none is usable.
+    """
+    coarse = surface(splats, min(_COARSE_CELLS, max(1, len(splats))))
+    depths, shares = outlooks(coarse, cameras)
+    alike = pose_kernel(cameras, depths)
+    usable = (depths > 0) & ~inside_geometry(splats, cameras, depths, progress)
+    if not usable.any():
+        raise InputError(unseeing(cameras, "the scene"))
+    return Candidates(alike, inverse_density(alike), shares, usable)
 
 
 def outlooks(cells: Surface, cameras: Cameras) -> tuple[Float, Float]:
@@ -115,7 +150,7 @@ def facility_location(alike: Float, pose_weights: Float, usable: NDArray[np.bool
         usable: (C,) mask of views that may be chosen.
         shares: (C,) from `outlooks`.
     """
-    away, worth = _bandwidths_apart(alike), shares**_SCENE_SHARE_EXPONENT
+    away, worth = bandwidths_apart(alike), shares**_SCENE_SHARE_EXPONENT
     best, left = np.zeros(len(alike)), usable.copy()
     nearest = np.where(usable, np.inf, -np.inf)
     order: list[int] = []
@@ -134,7 +169,7 @@ def facility_location(alike: Float, pose_weights: Float, usable: NDArray[np.bool
     return np.array(order, np.int64)
 
 
-def _bandwidths_apart(alike: Float) -> Float:
+def bandwidths_apart(alike: Float) -> Float:
     """Return (C, C) distances in bandwidths of the kernel."""
     return np.asarray(np.sqrt(-np.log(np.maximum(alike, np.finfo(np.float64).tiny))))
 
@@ -146,24 +181,6 @@ def gains_of(order: Order, alike: Float, pose_weights: Float) -> Float:
         gains.append(float(pose_weights @ np.maximum(alike[:, view] - best, 0.0)))
         best = np.maximum(best, alike[:, view])
     return np.array(gains)
-
-
-def farthest(alike: Float, usable: NDArray[np.bool_]) -> tuple[Order, Float]:
-    """Order by farthest pose, starting at the most central; gains are distances to the nearest chosen one."""
-    if not usable.any():
-        return np.zeros(0, np.int64), np.zeros(0)
-    away = _bandwidths_apart(alike)
-    first = int(np.argmax(np.where(usable, alike[:, usable].sum(1), -1.0)))
-    order, gains = [first], [float(away[usable, first].max())]
-    nearest = np.where(usable, away[first], -1.0)
-    nearest[first] = -1.0
-    for _ in range(int(usable.sum()) - 1):
-        view = int(np.argmax(nearest))
-        order.append(view)
-        gains.append(float(nearest[view]))
-        nearest = np.where(nearest >= 0, np.minimum(nearest, away[view]), -1.0)
-        nearest[view] = -1.0
-    return np.array(order, np.int64), np.array(gains)
 
 
 def draw_weights(order: Order, alike: Float, pose_weights: Float) -> Float:

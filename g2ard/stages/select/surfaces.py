@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,8 +25,8 @@ _CORE = _core.defaults()["coverage"]
 
 
 @dataclass(frozen=True)
-class SurfaceOptions(Settings):
-    """Options of the surface-based policies (the paper, eq. `view_selection`; `tab:s_avs`).
+class CoverageOptions(Settings):
+    """Options of the policy `directional` (the paper, eq. `view_selection`; `tab:s_avs`).
 
     Args:
         cells: number M of surface cells (adaptive voxels).
@@ -35,28 +35,17 @@ class SurfaceOptions(Settings):
         epsilon: ε of the coverage ratio C_jk / (P_jk + ε).
         depth_tolerance: a cell is visible if its depth differs from the pixel's by at most this share, or by
             a cell's size.
+        kappa: sharpness of the observation kernel and of the targets.
+        anchors: directions on the sphere, at most 64, at which targets and observations are evaluated.
     """
 
-    kappa: ClassVar[float] = _CORE["kappa"]
-    anchors: ClassVar[int] = _CORE["anchors"]
     cells: AtLeastOne = 300_000
     alpha: NotNegative = _CORE["alpha"]
     offset: Positive = _CORE["offset"]
     epsilon: Positive = _CORE["epsilon"]
     depth_tolerance: NotNegative = 0.01
-
-
-@dataclass(frozen=True)
-class CoverageOptions(SurfaceOptions):
-    """Options of the policy `directional`, and of `coverage` except for directions.
-
-    Args:
-        kappa: sharpness of the observation kernel and of the targets.
-        anchors: directions on the sphere, at most 64, at which targets and observations are evaluated.
-    """
-
-    kappa: Positive = _CORE["kappa"]  # type: ignore[misc]
-    anchors: Annotated[int, Within("[1, 64]")] = _CORE["anchors"]  # type: ignore[misc]
+    kappa: Positive = _CORE["kappa"]
+    anchors: Annotated[int, Within("[1, 64]")] = _CORE["anchors"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,7 +90,7 @@ def visible_cells(
     cells: Surface,
     cameras: Cameras,
     *,
-    depth_tolerance: float = SurfaceOptions.depth_tolerance,
+    depth_tolerance: float = CoverageOptions.depth_tolerance,
     progress: Progress = silent,
 ) -> tuple[NDArray[np.uint64], NDArray[np.uint32]]:
     """Compute the visibility ν_jv of a scene's cells in C views, world coordinates, from its median depth.
@@ -142,8 +131,7 @@ def core_views(cameras: Cameras, origin: Float, scene: tuple[Any, ...]) -> list[
 def greedy(
     splats: Splats,
     cameras: Cameras,
-    policy: str,
-    options: SurfaceOptions | None,
+    options: CoverageOptions | None,
     progress: Progress,
     seconds: dict[str, float],
 ) -> tuple[Order, Float, int]:
@@ -163,9 +151,9 @@ def greedy(
         cells.parts,
         (starts, seen, np.ascontiguousarray(cameras.recentred(cells.origin).positions)),
         len(cameras),
-        policy == "directional",
-        options,
-        counter(progress, "select"),
+        directional=True,
+        config=options,
+        progress=counter(progress, "select"),
     )
     seconds["greedy"] = time.perf_counter() - began
     keep = usable[order]
