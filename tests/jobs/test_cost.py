@@ -199,6 +199,10 @@ def test_a_dry_run_of_clean_is_of_the_kinds_requested(folder: Path, command_line
     assert 0 < giants["seconds"] < needles["seconds"] < whole["seconds"]
     told = succeeds(command_line, folder, "clean", "ball.ply", "--only", "none", "--dry-run").err
     assert "400 Gaussians: roughly 1 s" in told
+    assert "--preview" not in told
+    whole_told = succeeds(command_line, folder, "clean", "ball.ply", "--dry-run").err
+    for text in (whole_told, succeeds(command_line, folder, "clean", "--help").out):
+        assert "--preview FILE.png without -o shows what would go" in " ".join(text.split())
 
 
 @pytest.mark.parametrize("command", ["recover", "adapt"])

@@ -81,6 +81,8 @@ def clean(
     """Remove clutter: invisible Gaussians, giants, needles, floaters; haze on request.
 
     Visibility is measured from generated views.
+
+    --preview FILE.png without -o shows what would go; --dry-run only estimates time and memory.
     """
     from g2ard.jobs.clean import clean as remove_clutter
     from g2ard.jobs.clean import kinds_of
@@ -142,6 +144,8 @@ def _tell_plan(run: Run, count: int, cost: Cost) -> None:
         f"{memory_of(cost)}"
     )
     run.say_dry()
+    if cost.views:
+        run.say("--preview FILE.png without -o shows what would go")
     run.result({"count": count, **asdict(cost), "seconds": cost.seconds})
 
 
