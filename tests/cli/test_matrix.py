@@ -26,8 +26,17 @@ from helpers.calls import CALLS, FIRST, WRITING, options_of, output_of
 from helpers.commands import CommandLine, refused, succeeds
 from helpers.killed import command, forked, killed
 
-CHEAP = {"device_notes", "device_state", "set_device", "set_threads", "num_threads", "defaults", "worker"}
-"""Functions of the core that only read or set its state."""
+CHEAP = {
+    "defaults",
+    "device_notes",
+    "device_state",
+    "num_threads",
+    "psnr",
+    "set_device",
+    "set_threads",
+    "worker",
+}
+"""Functions of the core that only read or set its state, or compare two images."""
 _TIMES = re.compile(r"seconds|time|rss|resumed|peak|^share$|^bytes$|config|^inputs$")
 """Keys of JSON that may differ between two runs of a call, one of which reads a config file."""
 _UNEQUAL = (".html", ".png")
