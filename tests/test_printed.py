@@ -1,4 +1,4 @@
-"""What the documentation prints is what the program prints; `tests/printed.py` runs the slow commands too."""
+"""Pages show what the program prints; `make printed` also runs their slow commands."""
 
 from pathlib import Path
 

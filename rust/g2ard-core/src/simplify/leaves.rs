@@ -13,10 +13,10 @@ use crate::scene::{Ordered, SceneRef, power_of_two_below};
 /// Gaussians that a few views do not see keep this share of their mass, because other views will see some of them.
 const UNSEEN: f32 = 0.2;
 /// Where small Gaussians carry the detail, the part of the mean Σ αT² that each gets by how visible it is, whatever its
-/// size. Measured on seven scenes under a sky: twice as much gains .1 dB there, and costs the sky .8.
+/// size. Measured on seven scenes under a sky: twice as much gains .1 dB.
 const EVEN: f64 = 0.5;
-/// There, weights are raised to one less this power: what a scene's own views see is nearly even, as a trainer splits
-/// Gaussians until they are, so the largest weights of a few planned views say more about these views than about the scene.
+/// There, weights are raised to 1 less this: a trainer splits what looks large, so that its own views saw all Gaussians
+/// nearly alike, and large weights in a few planned views say more about these views than about the scene.
 const LEVELLED: f64 = 0.5;
 
 /// Largest scale in units.
@@ -219,7 +219,7 @@ impl<'a> Leaves<'a> {
         visibility.weight[self.ordered.rows[ordered as usize] as usize].max(0.0)
     }
 
-    /// A weight, closer to the others'. Costs are linear in weights, so that their unit does not matter.
+    /// Brings a weight closer to the others'. Costs are linear in weights, so that their unit does not matter.
     fn level(&self, weight: f32) -> f32 {
         let less = LEVELLED * self.importance.small_carry_detail();
         if less == 0.0 {
