@@ -18,8 +18,10 @@ if TYPE_CHECKING:
 
 _PLAIN_PERIOD = 10.0
 """Seconds between lines of a stage when stderr is not a terminal that can redraw its last line."""
-_LIVE_LINE_DELAY, _LIVE_LINE_PERIOD = 0.4, 0.125
-"""Seconds before the live line appears, and between its updates; short commands never import rich."""
+_LIVE_LINE_DELAY = 0.4
+"""Seconds before the live line appears: short commands never import rich."""
+_LIVE_LINE_PERIOD = 0.125
+"""Seconds between updates of the live line."""
 _SILENT_SECONDS = 1.0
 """Seconds after the end of a stage until the live line says that the command is still working."""
 _STEADY = 1.5

@@ -19,8 +19,11 @@ if TYPE_CHECKING:
     from g2ard.report.run import KindScore, RunReport, ViewsReport
     from g2ard.scene.splats import Splats
 
-_REPORTED_PSNR_LOSS, _REPORTED_SSIM_LOSS = 0.05, 0.001
-"""Losses against the simplified scene that are reported, in dB and SSIM."""
+_REPORTED_PSNR_LOSS = 0.05
+"""Loss against the simplified scene that is reported, in dB."""
+
+_REPORTED_SSIM_LOSS = 0.001
+"""Loss of SSIM against the simplified scene that is reported."""
 
 _HARMFUL_SIZE = 3.0
 """Loss in dB at the views' own size, against that of training, above which --size is warned of."""

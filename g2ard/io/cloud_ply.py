@@ -26,7 +26,8 @@ from g2ard.io.types import Float32, Points, Values
 _POSITION = ["x", "y", "z"]
 
 
-_PACKED, _INTENSITIES = ("rgb", "rgba"), ("intensity", "reflectance", "reflectivity")
+_PACKED = ("rgb", "rgba")
+_INTENSITIES = ("intensity", "reflectance", "reflectivity")
 
 
 class Stream(PointStream):

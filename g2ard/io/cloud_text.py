@@ -34,7 +34,10 @@ _TRIPLES = {6: (3,), 7: (4, 3), 8: (5, 4, 3), 9: (6, 3), 10: (7, 6, 4, 3)}
 
 _ALIKE = 0.5  # least correlation of the channels of colours that tells them from other columns
 
-_LINES, _HEAD = 50, 1 << 16  # lines that may be a heading, and bytes that tell whether a text is a table
+_LINES = 50
+"""Lines that may be a heading."""
+_HEAD = 1 << 16
+"""Bytes that tell whether a text is a table."""
 
 
 class Stream(HeldPoints):

@@ -261,8 +261,10 @@ _COUNT = Columns.of("Q", "COUNT")
 _CAMERA = Columns.of("iiQQ", "CAMERA_ID", "MODEL", "WIDTH", "HEIGHT")
 _IMAGE = Columns.of("IdddddddI", "IMAGE_ID", *_POSE, "CAMERA_ID")
 _POINTS = Columns.of("Q", "POINTS2D")
-_RIG, _SENSOR = Columns.of("II", "RIG_ID", "NUM_SENSORS"), Columns.of("iI", "SENSOR_TYPE", "SENSOR_ID")
-_HAS_POSE, _IN_RIG = Columns.of("B", "HAS_POSE"), Columns.of("ddddddd", *_POSE)
+_RIG = Columns.of("II", "RIG_ID", "NUM_SENSORS")
+_SENSOR = Columns.of("iI", "SENSOR_TYPE", "SENSOR_ID")
+_HAS_POSE = Columns.of("B", "HAS_POSE")
+_IN_RIG = Columns.of("ddddddd", *_POSE)
 _FRAME = Columns.of("IIdddddddI", "FRAME_ID", "RIG_ID", *_POSE, "NUM_DATA_IDS")
 _DATA = Columns.of("iIQ", "SENSOR_TYPE", "SENSOR_ID", "DATA_ID")
 _WORDS = ("MODEL", "SENSOR_TYPE")  # columns that are numbers in binary tables, and words in text
@@ -398,7 +400,8 @@ def _is_points(line: str) -> bool:
     return len(words) % 3 == 0 and all(map(_WHOLE.fullmatch, ids)) and numbers
 
 
-_WHOLE, _NUMBER = re.compile(r"-?\d+"), re.compile(r"[+-]?[\d.]+(e[+-]?\d+)?", re.IGNORECASE)
+_WHOLE = re.compile(r"-?\d+")
+_NUMBER = re.compile(r"[+-]?[\d.]+(e[+-]?\d+)?", re.IGNORECASE)
 
 
 def _params(count: int) -> list[str]:

@@ -98,8 +98,11 @@ _OTHER_KINDS: dict[tuple[Kind, Kind], str] = {
 }
 """Hints by the expected and the found kind of a file."""
 
-MANIFEST, POINTS = "tiles.json", ".points"
-"""Files of finished and unfinished folders of tiles, and their folder of points to lift."""
+MANIFEST = "tiles.json"
+"""File of finished and unfinished folders of tiles."""
+
+POINTS = ".points"
+"""Their folder of points to lift."""
 
 _MOST_INSPECTED_FILES = 64  # maximum files of a folder to inspect for suggestions
 _MOST_SEARCHED_FILES = 256  # maximum files of a folder and those below to look for signs of other programs

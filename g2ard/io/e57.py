@@ -25,7 +25,8 @@ from g2ard.scene.transform import rotation_matrices
 
 _CARTESIAN = ("cartesianX", "cartesianY", "cartesianZ")
 _SPHERICAL = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")
-_COLORS, _INTENSITY = ("colorRed", "colorGreen", "colorBlue"), ("intensity",)
+_COLORS = ("colorRed", "colorGreen", "colorBlue")
+_INTENSITY = ("intensity",)
 _UNSEEN = {_COLORS: ("isColorInvalid",), _INTENSITY: ("isIntensityInvalid",)}
 _SAMPLE_ROWS = 100_000  # points of each scan that tell where it is and how it is coloured
 

@@ -54,8 +54,12 @@ _SPLATS = re.compile(r"[A-Z]+_(gaussian_splat|spz)")
 
 LINEAR_NOTE = Note("linear_colors", 1, "linear colours are taken as sRGB, so renders are too dark")
 _SPZ_VERSION = 3
-_MAGIC, _JSON, _BIN = 0x46546C67, 0x4E4F534A, 0x004E4942
-_FLOAT, _USHORT, _UBYTE = 5126, 5123, 5121
+_MAGIC = 0x46546C67  # "glTF"
+_JSON = 0x4E4F534A  # "JSON"
+_BIN = 0x004E4942  # "BIN"
+_FLOAT = 5126
+_USHORT = 5123
+_UBYTE = 5121
 _TYPES = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 _DTYPES = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
 _GLTF_TURN = np.array([-1.0, -1, 1])

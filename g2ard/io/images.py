@@ -32,8 +32,11 @@ from g2ard.scene.lenses import PhotoLens
 from g2ard.scene.samples import evenly_spaced
 
 _BORDER_PHOTOS = 5  # photos whose borders are compared
-_BORDER_COLOUR_SLACK, _BORDER_SHARE = 3 / 255, 0.8
-"""Largest difference from a constant border colour, and the least share of border pixels that have it."""
+_BORDER_COLOUR_SLACK = 3 / 255
+"""Largest difference from a constant border colour."""
+
+_BORDER_SHARE = 0.8
+"""Least share of border pixels that have a constant border colour."""
 
 
 def load_photo(

@@ -19,8 +19,11 @@ _LARGEST_CHUNK = 1 << 30
 """Largest chunk, in bytes of unpacked points, of a file with fewer points than a chunk holds."""
 
 
-_SAMPLES, _SAMPLE_ROWS = 20, 5000
-"""Number and length of the runs of points that tell where a file's points are."""
+_SAMPLES = 20
+"""Runs of points that tell where a file's points are."""
+
+_SAMPLE_ROWS = 5000
+"""Points of each of these runs."""
 
 _NOISE = (7, 18)  # classes of low and high noise
 

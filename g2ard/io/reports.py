@@ -13,8 +13,14 @@ from g2ard.system.shown import Shown
 LEFT_OUT = {"left_out": True}
 """Metadata of an optional field that JSON omits without a value."""
 
-_LINE, _VALUE, _ROW = 90, 40, 120
-"""Most characters of a report in one line, of a value in it, and of a value in a row of its own."""
+_LINE = 90
+"""Most characters of a report in one line."""
+
+_VALUE = 40
+"""Most characters of a value in a line of others."""
+
+_ROW = 120
+"""Most characters of a value in a row of its own."""
 
 
 @dataclass(frozen=True)

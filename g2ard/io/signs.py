@@ -16,7 +16,8 @@ from typing import NamedTuple, ParamSpec, TypeVar
 from g2ard.errors import InputError
 
 _HEAD = 1 << 16  # bytes of a file, and of a member of an archive, to look into
-_ZIP, _GZIP = b"PK\3\4", b"\x1f\x8b"
+_ZIP = b"PK\3\4"
+_GZIP = b"\x1f\x8b"
 PHOTOS = (b"\xff\xd8\xff", b"\x89PNG\r\n", b"RIFF", b"II*\0", b"MM\0*")  # first bytes of photos
 
 Given = ParamSpec("Given")
@@ -86,7 +87,8 @@ def _poses(
     return Sign(what, todo, starts, words, names, poses=True)
 
 
-_CAPTURE, _PIX4D = "a table of cameras of RealityCapture (RealityScan)", "cameras of Pix4D"
+_CAPTURE = "a table of cameras of RealityCapture (RealityScan)"
+_PIX4D = "cameras of Pix4D"
 
 _AS_TEXT = (
     b"changed by a transfer as text"  # what `_head` adds to binary files all of whose line ends are CR LF

@@ -18,8 +18,14 @@ from g2ard.scene.transform import restored
 _ROW = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
 
 
-_FAR, _POSSIBLE = 1e18, 0.75  # largest scale, and least share of rows with possible values
-_READ, _TEXT = 128, [*range(9, 14), *range(32, 127)]  # rows, and bytes that are all of a text
+_FAR = 1e18
+"""Largest possible scale."""
+_POSSIBLE = 0.75
+"""Least share of rows with possible values."""
+_READ = 128
+"""Rows that are looked at."""
+_TEXT = [*range(9, 14), *range(32, 127)]
+"""Bytes that are all of a text."""
 
 
 class Stream(RawStream):

@@ -36,7 +36,8 @@ _HEADER = 16  # size of the header, bytes
 _GZIP_BLOCK = 1 << 20  # bytes packed between two reports of progress, a fraction of a second
 _POSITION_BITS = 24
 _COEFFICIENTS = (0, 3, 8, 15, 24)
-_ANTIALIASED, _HAS_EXTENSIONS = 0x1, 0x2
+_ANTIALIASED = 0x1
+_HAS_EXTENSIONS = 0x2
 _COORDINATE_SYSTEM = 0xADBE0003
 _OWN_PLACE = 0x67320001
 """Record of version 4 with `own_place` as JSON, which older versions have in their gzip header's comment."""
@@ -57,7 +58,10 @@ _COLOR_SCALE = 0.15  # SPZ's factor for band 0, which leaves room for colours ou
 FLIPS = harmonic_signs((1, -1, -1))
 """Signs of harmonics, which differ between SPZ's axes and those of a .ply."""
 
-_USUAL_BITS, _MOST_BITS = 12, 20
+_USUAL_BITS = 12
+"""Fractional bits of positions, if they suffice."""
+_MOST_BITS = 20
+"""Most fractional bits of positions."""
 
 
 def read(path: Path) -> Noted:

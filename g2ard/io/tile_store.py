@@ -28,7 +28,8 @@ from g2ard.io.types import Float, Float32, Notes
 from g2ard.scene.kdtree import KdTree
 from g2ard.scene.splats import Splats
 
-FORMAT, VERSION = "g2ard tiles", 1
+FORMAT = "g2ard tiles"
+VERSION = 1
 
 _ROWS_AT_ONCE = 1 << 16  # rows read at a time
 

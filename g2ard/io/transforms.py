@@ -25,7 +25,8 @@ _NO_COEFFICIENTS = ("k4", "k5", "k6", "s1", "s2", "s3", "s4")
 """Coefficients that lenses lack; of these, fisheyes have k4."""
 
 _LEAST_ANGLE = 1e-6  # smallest distance of a field of view from 0 and π, radians
-_TRAIN, _TEST = "transforms_train.json", "transforms_test.json"
+_TRAIN = "transforms_train.json"
+_TEST = "transforms_test.json"
 
 _APART = {"test_frames": "test", "val_frames": "val", "eval_frames": "test"}
 """Further lists of frames, as of ScanNet++, and their splits."""

@@ -27,8 +27,12 @@ from g2ard.stages.simplify import simplify
 
 _PROBE_ROWS = 4096
 """Gaussians of the first probe file, which estimates the bytes per Gaussian."""
-_BYTES_PROBES, _BYTES_ACCEPTED, _BYTES_GOAL = 6, 0.98, 0.99
-"""Most files written to find a count for bytes; shares of the bytes that are accepted and sought."""
+_BYTES_PROBES = 6
+"""Most files written to find a count for bytes."""
+_BYTES_ACCEPTED = 0.98
+"""Least share of the bytes that is accepted."""
+_BYTES_GOAL = 0.99
+"""Share of the bytes that is sought."""
 _QUALITY_TRIALS = 8
 """Most counts at which quality is measured."""
 _QUALITY_TOLERANCE = 0.25

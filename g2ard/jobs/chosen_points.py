@@ -29,7 +29,8 @@ _ROWS = 1 << 20
 _SAMPLE = 100_000
 """Chosen points that tell where a cloud is and what its intensities are."""
 
-_PLACE, _SHADES = ("x", "y", "z"), ("red", "green", "blue")
+_PLACE = ("x", "y", "z")
+_SHADES = ("red", "green", "blue")
 
 _COLUMNS: dict[PointColor, tuple[str, ...]] = {
     "intensity": ("intensity", "reflectance", "reflectivity"),

@@ -25,8 +25,10 @@ from g2ard.scene.splats import SH_C0, Splats, check_finite
 from g2ard.stages.clean import FLOATING, KINDS, Cleaning, compare_depths, find_clutter
 from g2ard.system.shown import Shown
 
-CLUTTER_VIEWS, CLUTTER_SIDE = 96, 400
-"""Number of generated views for finding clutter, and their longer side in pixels."""
+CLUTTER_VIEWS = 96
+"""Number of generated views for finding clutter."""
+CLUTTER_SIDE = 400
+"""Longer side of these views in pixels."""
 _CLUTTER_ROWS = 100_000
 """Gaussians that those views are planned on."""
 _CLUTTER_NEAR = 0.25

@@ -8,8 +8,17 @@ from g2ard.rendering.visibility import overdraw
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats
 
-_NEAR_VIEWS, _NEAR_POOL, _NEAR_SIZE, _NEAR_ROWS = 6, 16, (320, 240), 50_000
-"""Near views, poses that they step from, their pixels, and the Gaussians they are planned by."""
+_NEAR_VIEWS = 6
+"""Number of near views."""
+
+_NEAR_POOL = 16
+"""Poses that near views step from."""
+
+_NEAR_SIZE = (320, 240)
+"""Pixels of near views."""
+
+_NEAR_ROWS = 50_000
+"""Gaussians that near views are planned by."""
 
 
 def close_up(splats: Splats) -> dict[str, float] | None:

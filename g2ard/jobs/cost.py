@@ -65,20 +65,24 @@ LARGEST_DENSE = 250_000
 """Largest dense scene that view.html shows beside the result: it adds at most 8 MB of SOG at SH degree 2."""
 _PROGRAM_BYTES = 65_000_000
 """Bytes of the interpreter and loaded libraries."""
-_SCENE_TIMES, _KEPT_TIMES = 2.7, 2.0
-"""Memory of simplification as a multiple of the scene's arrays, and of the scene and its prepared copy, which
-stay until the end. Measured on 60,000 and 200,000 Gaussians of SH degree 0 and 3."""
-_SURVEY, _LOOKS = (35_000_000, 500), (35_000_000, 800)
-"""Bytes, and bytes per Gaussian of a sample, that planning views or measuring visibility leaves, and that the
-choice of views to show takes."""
+_SCENE_TIMES = 2.7
+"""Memory of simplification as a multiple of the scene's arrays. Measured, as the next, on 60,000 and 200,000
+Gaussians of SH degree 0 and 3."""
+_KEPT_TIMES = 2.0
+"""Memory of the scene and its prepared copy, which stay until the end, as a multiple of its arrays."""
+_SURVEY = (35_000_000, 500)
+"""Bytes, and bytes per Gaussian of a sample, that planning views or measuring visibility leaves."""
+_LOOKS = (35_000_000, 800)
+"""Bytes, and bytes per Gaussian of a sample, that the choice of views to show takes."""
 _SAMPLE = 150_000
 """Largest sample on which views are planned and chosen."""
 _IMAGE_BYTES = 60
 """Bytes per pixel of a view that is rendered and scored, of which every thread of `in_threads` has one."""
-_PACKED_BYTES, _PALETTE_BYTES = 200, 1_300
-"""Bytes of packing the viewer page: per Gaussian, and per entry of the palette of harmonics, of which there
-are at most 65,536. Measured: 22 and 39 MB for 20,000 Gaussians of SH degree 1 and 3, 97 for 150,000 of degree
-2, 118 for 250,000 of degree 3."""
+_PACKED_BYTES = 200
+"""Bytes per Gaussian of packing the viewer page. Measured with the next: 22 and 39 MB for 20,000 Gaussians of
+SH degree 1 and 3, 97 for 150,000 of degree 2, 118 for 250,000 of degree 3."""
+_PALETTE_BYTES = 1_300
+"""Bytes per entry of the page's palette of harmonics, of which there are at most 65,536."""
 TRAINER_BYTES = 983
 """Bytes per Gaussian in recovery: parameters, Adam's moments, buffers (`docs/benchmarks.md`)."""
 

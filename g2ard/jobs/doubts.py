@@ -13,14 +13,23 @@ from g2ard.scene.splats import Splats
 _SAMPLE = 8192
 """Gaussians that represent a scene."""
 
-_COARSE, _UNFRAMED = 0.2, 0.5
-"""Shares of the scene below a pixel in all views, and in no view, above which views are warned of."""
+_COARSE = 0.2
+"""Share of the scene below a pixel in all views above which views are warned of."""
 
-_EMPTIED, _LEVELS = 10.0, 3
-"""Factor on the requested reduction above which a region is warned of, and halvings that make regions."""
+_UNFRAMED = 0.5
+"""Share of the scene in no view above which views are warned of."""
 
-_REGION_ROWS, _FEWEST = 400_000, 1024
-"""Most Gaussians whose regions are counted, and fewest of a scene that has regions."""
+_EMPTIED = 10.0
+"""Factor on the requested reduction above which a region is warned of."""
+
+_LEVELS = 3
+"""Halvings that make regions."""
+
+_REGION_ROWS = 400_000
+"""Most Gaussians whose regions are counted."""
+
+_FEWEST = 1024
+"""Fewest Gaussians of a scene that has regions."""
 
 _FAR = 0.05
 """Share of the Gaussians beyond a gap above which the scene has a sky or surroundings."""

@@ -17,12 +17,18 @@ from g2ard.report.run import Packed
 from g2ard.scene.splats import Splats
 from g2ard.scene.transform import change_of_axes, with_axes
 
-_WARNED_LOSS, _INVISIBLE_LOSS_PSNR = 1.0, 45.0
-"""Loss that is worth a warning, and the PSNR above which nobody sees it, dB."""
+_WARNED_LOSS = 1.0
+"""Loss in dB that is worth a warning."""
+_INVISIBLE_LOSS_PSNR = 45.0
+"""PSNR in dB above which nobody sees a loss."""
 _GOOD_PSNR = 35.0
 """PSNR of a good scene, to which the difference between two scenes is related, dB."""
-_LOSS_VIEWS, _LOSS_SIZE, _LOSS_ROWS = 4, (400, 300), 100_000
-"""Generated views to compare in: their number, pixels, and the Gaussians they are planned by."""
+_LOSS_VIEWS = 4
+"""Number of generated views to compare in."""
+_LOSS_SIZE = (400, 300)
+"""Pixels of these views."""
+_LOSS_ROWS = 100_000
+"""Gaussians that these views are planned by."""
 _MOST_COMPARED_GAUSSIANS = 2_000_000
 """Gaussians above which scenes are not compared."""
 

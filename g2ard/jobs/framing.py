@@ -21,20 +21,38 @@ _EXTREMES = (0.1, 10.0)
 _ASPECTS = (0.4, 0.5, 0.65, 0.8, 1.0, 1.25, 1.6, 2.0, 2.5)
 """Aspects for which the surroundings of a photo are measured: from a phone upright to one on its side."""
 
-_SUBJECT, _MARGIN = 0.995, 1.1
-"""Share of the points in a view that its subject consists of, along each axis, and room around it."""
+_SUBJECT = 0.995
+"""Share of the points in a view that its subject consists of, along each axis."""
 
-_SIDE, _PHOTO_SIDE = 200, 64
-"""Pixels along a side of the picture of a photo's surroundings, and of the photos' depths."""
+_MARGIN = 1.1
+"""Factor on the subject's width that leaves room around it."""
 
-_ROWS, _PHOTOS = 200_000, 64
-"""Gaussians and photos that are used, at most."""
+_SIDE = 200
+"""Pixels along a side of the picture of a photo's surroundings."""
 
-_WITNESSES, _TOLERANCE = 3, 0.1
-"""Photos that must see a surface for it to be known, and how far from their depths it may be, relative."""
+_PHOTO_SIDE = 64
+"""Pixels along a side of the photos' depths."""
 
-_UNSEEN, _FINEST, _STEPS = 0.05, 0.05, 60
-"""Share of a window that no photo need see, the least share of the view that is shown, and views between."""
+_ROWS = 200_000
+"""Most Gaussians that are used."""
+
+_PHOTOS = 64
+"""Most photos that are used."""
+
+_WITNESSES = 3
+"""Photos that must see a surface for it to be known."""
+
+_TOLERANCE = 0.1
+"""Largest relative distance of a known surface from the depths of photos."""
+
+_UNSEEN = 0.05
+"""Share of a window that no photo need see."""
+
+_FINEST = 0.05
+"""Least share of the view that is shown."""
+
+_STEPS = 60
+"""Views tried between the whole view and the least share."""
 
 _EMPTY = 0.05
 """Share of a photo without matter above which emptiness is what photos show."""

@@ -13,13 +13,21 @@ from g2ard.io.stream import PointStream, SceneStream
 from g2ard.io.tile_store import TileStore, row_width
 from g2ard.jobs.tile_options import Tiling, cut_into
 
-WHOLE_TIMES, LEVELS_TIMES = 3.6, 7.0
-"""Memory in one piece as a multiple of the scene's arrays: simplification, and levels without recovery."""
+WHOLE_TIMES = 3.6
+"""Memory of simplification in one piece as a multiple of the scene's arrays."""
 
-_TASK_BYTES, _ROW_BYTES, _ROW_TIMES = 200_000_000, 290, 0.8
-"""Peak memory of a task: bytes of the program, bytes per Gaussian (halo included), and a multiple of its
-arrays. Measured: 1.95 GB for 5.5 million of SH 0, 0.98 GB for 1.8 million of SH 3
-(`docs/benchmarks.md`)."""
+LEVELS_TIMES = 7.0
+"""Memory of levels without recovery in one piece as a multiple of the scene's arrays."""
+
+_TASK_BYTES = 200_000_000
+"""Bytes of a task's program. The peak of a task, measured: 1.95 GB for 5.5 million Gaussians of SH 0, 0.98 GB
+for 1.8 million of SH 3 (`docs/benchmarks.md`)."""
+
+_ROW_BYTES = 290
+"""Bytes of a task per Gaussian, halo included."""
+
+_ROW_TIMES = 0.8
+"""Further memory of a task as a multiple of its arrays."""
 
 RECOVERY_TIMES = 1.5
 """Memory of recovering or scoring a tile, renders included, relative to merging it."""

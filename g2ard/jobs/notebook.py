@@ -35,8 +35,10 @@ from g2ard.viewer.page import write_page
 
 _SIZE = (480, 360)
 """Width and height in pixels of a scene's picture."""
-_TARGETS, _TARGET = 4, 240
-"""Targets in a picture, and the longer side of each in pixels."""
+_TARGETS = 4
+"""Targets in a picture."""
+_TARGET = 240
+"""Longer side of a target in a picture, in pixels."""
 _LARGEST = 10_000_000
 """Bytes of a page that a notebook embeds, and that its file then holds, at most."""
 _FRAME = 640

@@ -30,8 +30,10 @@ from g2ard.scene.cameras import Cameras
 from g2ard.scene.samples import evenly_spaced
 from g2ard.stages.lift import merged
 
-_COARSE_VOXELS, _FINE_VOXELS = 64, 128
-"""Voxels per side of the grid that finds the object's box, and of the grid within it."""
+_COARSE_VOXELS = 64
+"""Voxels per side of the grid that finds the object's box."""
+_FINE_VOXELS = 128
+"""Voxels per side of the grid within that box."""
 _EMPTY_VIEWS_SHARE = 0.02
 """Share of the views that may see a voxel as empty, because single outlines have errors."""
 _SEEING_VIEWS_SHARE = 0.25
@@ -148,28 +150,41 @@ def grown(mask: Mask, radius: int) -> Mask:
     return mask
 
 
-_PIXELS_PER_GAUSSIAN, _MOST_USUAL_COUNT, _SAMPLED_PHOTOS = 100, 100_000, 16
-"""Pixels per Gaussian, most Gaussians, and photos that are looked at, if no count is given."""
+_PIXELS_PER_GAUSSIAN = 100
+"""Pixels per Gaussian, if no count is given."""
+_MOST_USUAL_COUNT = 100_000
+"""Most Gaussians, if no count is given."""
+_SAMPLED_PHOTOS = 16
+"""Photos that are looked at, if no count is given."""
 _PHOTO_SIDE = 240
 """Longer side in pixels of the photos used to place points."""
 _TRIAL_DEPTHS = 48
 _HULL_DEPTHS = 96
 """Trial depths across a visual hull."""
-_NEAREST_DEPTH, _FARTHEST_DEPTH = 0.3, 4.0
-"""Range of trial depths, evenly spaced in 1/z, as multiples of the view's distance from the common centre."""
+_NEAREST_DEPTH = 0.3
+"""Nearest trial depth as a multiple of the view's distance from the common centre. Trial depths are evenly
+spaced in 1/z."""
+_FARTHEST_DEPTH = 4.0
+"""Farthest trial depth as a multiple of the same distance."""
 _EMPTY_COLOUR_SLACK = 2 / 255
 """A pixel this close to the background colour is empty."""
 _EQUAL_COST_SLACK = 0.01
 """Difference of costs within which depths in a hull count as equal."""
-_COMPARED_VIEWS, _AGREEING_VIEWS = 6, 2
-"""Number of nearby views compared, and of those that agree best, whose mean counts."""
+_COMPARED_VIEWS = 6
+"""Number of nearby views compared."""
+_AGREEING_VIEWS = 2
+"""Number of compared views that agree best, whose mean counts."""
 _PATCH = np.array([(0, 0), (-1, -1), (-1, 0), (-1, 1), (0, -1), (0, 1), (1, -1), (1, 0), (1, 1)])
 _PATCH_SPACING = 120
 """Rows and columns of the compared pixels, from a ray's own, in units of this part of the photo's side."""
-_REFINED_DEPTHS, _FINER_DEPTHS = 3, 5
-"""Depths of a ray that are refined, and finer trials around each."""
-_MOST_POINT_COST, _MOST_POINT_COST_SHARE = 0.05, 0.25
-"""Largest cost of a point, absolute and as a share of the usual cost on its ray."""
+_REFINED_DEPTHS = 3
+"""Depths of a ray that are refined."""
+_FINER_DEPTHS = 5
+"""Finer trials around each refined depth."""
+_MOST_POINT_COST = 0.05
+"""Largest cost of a point."""
+_MOST_POINT_COST_SHARE = 0.25
+"""Largest cost of a point as a share of the usual cost on its ray."""
 _RAYS_PER_DOUBLING = 8
 """Rays per requested point after which both limits of cost are doubled."""
 _RAYS = 2048

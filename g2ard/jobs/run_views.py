@@ -49,21 +49,34 @@ _SHAPE = (800, 600)
 FULL_PIXELS = 8_000_000
 """Pixels of the views that are scored at their own size after a requested one."""
 
-_POOL_VIEWS, _TRAINING_VIEWS, _POOL_GROWTH = 128, 112, 2.0
-"""Generated usual views, those of them that train (every 8th is held out for scoring), and the largest factor
-if a view shows little of the scene."""
-_OFFERED_VIEWS, _VIEWS_APART = 64, 16
-"""Views of each other kind from which training views are chosen, and further ones: one half validates
-recovery, the other is scored."""
-_POOL_STEPS, _POOL_POWER, _LEAST_SHARE = 1400, 0.6, 0.15
-"""Steps for which the whole pool is used, the power of fewer ones that is the share used, and its least: runs
-of few steps plan, render and score few views."""
+_POOL_VIEWS = 128
+"""Generated usual views."""
+_TRAINING_VIEWS = 112
+"""Usual views that train: every 8th is held out for scoring."""
+_POOL_GROWTH = 2.0
+"""Largest factor on the usual views if a view shows little of the scene."""
+_OFFERED_VIEWS = 64
+"""Views of each other kind from which training views are chosen."""
+_VIEWS_APART = 16
+"""Further views of each other kind: one half validates recovery, the other is scored."""
+_POOL_STEPS = 1400
+"""Steps for which the whole pool is used: runs of few steps plan, render and score few views."""
+_POOL_POWER = 0.6
+"""Power of the share of these steps that is the share of the pool used."""
+_LEAST_SHARE = 0.15
+"""Least share of the pool used."""
 _STEP_SECONDS = 0.03
 """Time of a step that a time limit is divided by, as on two cores."""
-_LEAST_SCORED, _LEAST_APART = 6, 8
-"""Least usual views that are scored, and least views of each other kind that validate and are scored."""
-_TWICE, _TWICE_VIEWS, _TWICE_LONGEST = "usual at 2×", 4, 2400
-"""Kind of views that are scored at twice their size, their number in a whole pool, and their longest side."""
+_LEAST_SCORED = 6
+"""Least usual views that are scored."""
+_LEAST_APART = 8
+"""Least views of each other kind that validate and are scored."""
+_TWICE = "usual at 2×"
+"""Kind of views that are scored at twice their size."""
+_TWICE_VIEWS = 4
+"""Number of these views in a whole pool."""
+_TWICE_LONGEST = 2400
+"""Longest side of these views in pixels."""
 _OTHER_KINDS = ("near", "standing", "anywhere")
 _COMPACT_ROWS = 100_000
 """Most Gaussians of the compact scene that the choice is measured on."""
@@ -72,14 +85,17 @@ _POOL_GAUSSIANS = 4_000_000
 _POOL_SAMPLE = 200_000
 """Gaussians that poses are planned on."""
 
-_ROUGH, _ROUGH_ROWS = "estimated", 10_000
-"""Kind of the stand-ins of dry runs, and Gaussians that place them."""
+_ROUGH = "estimated"
+"""Kind of the stand-ins of dry runs."""
+_ROUGH_ROWS = 10_000
+"""Gaussians that place these stand-ins."""
 _USUAL_OTHERS = 0.4
 """Views of other kinds that join usual ones, over their number: 0.4 to 0.6 on playbot and autzen."""
 
-_WEIGHT_VIEWS, _WEIGHT_ROWS = 80, 100_000
-"""Usual views that weigh Gaussians, of which as many are used as the scene needs, and the Gaussians that they
-are planned on."""
+_WEIGHT_VIEWS = 80
+"""Usual views that weigh Gaussians, of which as many are used as the scene needs."""
+_WEIGHT_ROWS = 100_000
+"""Gaussians that these views are planned on."""
 _WEIGHT_OTHERS = {"near": 8, "anywhere": 16}
 """Views of other kinds beside these: usual ones may all stand outside a closed room (decision 0040)."""
 

@@ -41,8 +41,10 @@ if TYPE_CHECKING:
     from g2ard.jobs.memory import TilePlan
     from g2ard.jobs.tile_options import Tiling
 
-_QUALITY_VIEWS, _QUALITY_SIDE = 12, 400
-"""Number of views in which quality is measured, and their longer side in pixels."""
+_QUALITY_VIEWS = 12
+"""Number of views in which quality is measured."""
+_QUALITY_SIDE = 400
+"""Longer side of these views in pixels."""
 _POOL_SAMPLE = 100_000
 """Gaussians that those views are planned on."""
 _BYTES_SAFETY = 0.985

@@ -24,8 +24,10 @@ _VIEW_SIDE = 800
 _SIGHT_SAMPLE = 4096
 _SEEING_CAMERA_SHARE = 0.5
 """Share of cameras that must see the scene for found views to be used."""
-_COMPARED_PHOTOS, _COMPARED_SIDE = 15, 160
-"""Number of photos compared with the scene, and their longer side in pixels."""
+_COMPARED_PHOTOS = 15
+"""Number of photos compared with the scene."""
+_COMPARED_SIDE = 160
+"""Longer side of compared photos in pixels."""
 _UNLIKE = 0.4
 """Correlation of render and photo below which they are considered unrelated. Medians: fox and caliterra with
 their own scenes (2,000 Gaussians, 20 steps) 0.86 and 0.50, plush with its own 0.98, with turned poses 0.30.
@@ -36,9 +38,11 @@ _OWN_SHARE = 0.75
 """Share of the compared photos that the own photo of a view must beat: chance gives a half, a scene of these
 photos all. Plush, caliterra, fox, chair and a city, as lifted points or at a twentieth of them: at least 0.95
 with their own photos; seven scenes with the photos of others: at most 0.74 if five views or more see them."""
-_FEW_GAUSSIANS, _FEW_OWN_SHARE = 1000, 0.6
-"""Gaussians below which a scene shows too little to be sure, and the share that is then enough for a warning.
-Eight draws of 250 to 500 points of a city: 0.6 or more for five of them with their own photos."""
+_FEW_GAUSSIANS = 1000
+"""Gaussians below which a scene shows too little to be sure."""
+_FEW_OWN_SHARE = 0.6
+"""Share that is enough for a warning of such a scene. Eight draws of 250 to 500 points of a city: 0.6 or more
+for five of them with their own photos."""
 _BACKGROUND_SLACK = 4 / 255
 """Difference of two background colours that matters."""
 _BLIND_VIEWS_SHARE = 0.1

@@ -39,8 +39,11 @@ TILE_OF_SCENE = np.array([[-1.0, 0, 0], [0, 0, -1], [0, -1, 0]])
 _SCREEN_SPACE_ERROR = 16.0
 """Error on the screen in pixels at which viewers refine a tile by default (maximumScreenSpaceError)."""
 
-_WGS84_RADIUS, _WGS84_FLATTENING = 6378137.0, 1 / 298.257223563
-"""Major half axis in metres and flattening of the ellipsoid WGS 84."""
+_WGS84_RADIUS = 6378137.0
+"""Major half axis of the ellipsoid WGS 84 in metres."""
+
+_WGS84_FLATTENING = 1 / 298.257223563
+"""Flattening of the ellipsoid WGS 84."""
 
 
 @dataclass(frozen=True)

@@ -39,9 +39,15 @@ _VISIBILITY_SIDE = 300
 """Longer side in pixels of the renders that measure visibility."""
 _HALF_SEEN_WEIGHT = 10.0
 """Σ αT over these renders at which a view counts as half."""
-_STEPS_PER_IMAGE, _FEWEST_STEPS, _MOST_STEPS = 50, 250, 7000
-"""Default steps: per image, at least, and at most as in the paper. A base colour moves by at most 0.28 × 0.03
-in a step and by half of that over a stretch, so that 250 steps span all of its range."""
+_STEPS_PER_IMAGE = 50
+"""Default steps per image."""
+
+_FEWEST_STEPS = 250
+"""Least default steps. A base colour moves by at most 0.28 × 0.03 in a step and by half of that over a
+stretch, so that 250 steps span all of its range."""
+
+_MOST_STEPS = 7000
+"""Most default steps, as in the paper."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,7 +136,8 @@ def appearance_only(schedule: Schedule) -> Schedule:
     return replace(schedule, rates=replace(schedule.rates, means=0.0, log_scales=0.0, quats=0.0))
 
 
-_TUNED, _PAPER = appearance_only(TUNED), appearance_only(PAPER)
+_TUNED = appearance_only(TUNED)
+_PAPER = appearance_only(PAPER)
 
 
 @dataclass(frozen=True)

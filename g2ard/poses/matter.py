@@ -30,20 +30,26 @@ _WIDEST = 16.0
 _SAMPLE = 200_000
 """Rows used for statistics; the occupancy grid uses all."""
 
-_CELLS, _CELLS_A_ROW = (2_000_000, 6_000_000), 5
-"""Least and most cells, with one per Gaussian in between: larger scenes get finer grids; and cells per row if
-the rows are a sample of a larger scene."""
+_CELLS = (2_000_000, 6_000_000)
+"""Least and most cells, with one per Gaussian in between: larger scenes get finer grids."""
 
-_OPAQUE, _MURKY = 0.3, 0.04
-"""Opacity × area per face of a cell, summed: above the first, hardly any light passes; above the second, the
-cell holds leaves, glass or haze, and no camera may stand there."""
+_CELLS_A_ROW = 5
+"""Cells per row if the rows are a sample of a larger scene."""
+
+_OPAQUE = 0.3
+"""Opacity × area per face of a cell, summed, above which hardly any light passes."""
+
+_MURKY = 0.04
+"""The same sum above which a cell holds leaves, glass or haze, and no camera may stand there."""
 
 _LEAST_SIDE = 1 / 256
 """Least side of the box as a share of its longest, so that a flat scene has a thickness."""
 
-_HALF_WIDTH, _PARTS = 1.6, 9
-"""Standard deviations from its centre within which a Gaussian fills cells, 89 % of it, and most sample points
-along an axis for one wider than a cell."""
+_HALF_WIDTH = 1.6
+"""Standard deviations from its centre within which a Gaussian fills cells, 89 % of it."""
+
+_PARTS = 9
+"""Most sample points along an axis for a Gaussian wider than a cell."""
 
 _REACH = 12
 """Largest distance stored, in cells: enough for rays to stride through free space."""

@@ -11,16 +11,26 @@ from g2ard.poses.site import Site
 from g2ard.scene.reproducible import Floats, between, directions, halton, norms, quantile, turned
 from g2ard.scene.samples import evenly_spaced
 
-_ELEVATIONS, _DISTANCES = (-5.0, 50.0), (0.9, 1.25)
-"""Ranges around an object: degrees above the horizon of its centre, and distances as multiples of that at
-which it just fits."""
+_ELEVATIONS = (-5.0, 50.0)
+"""Range of views around an object: degrees above the horizon of its centre."""
 
-_FITTING, _OUTLINE = 0.97, 8_000
-"""Share of the matter in frame when the object just fits, and the points that represent its outline."""
+_DISTANCES = (0.9, 1.25)
+"""Range of their distances, as multiples of that at which the object just fits."""
 
-_FILLED, _WHOLE, _ROUNDS = 0.9, 0.998, 6
-"""Share of the frame that a view of the whole fills, the share of the matter that is the whole, and steps in
-which such a view finds its place."""
+_FITTING = 0.97
+"""Share of the matter in frame when the object just fits."""
+
+_OUTLINE = 8_000
+"""Points that represent an object's outline."""
+
+_FILLED = 0.9
+"""Share of the frame that a view of the whole fills."""
+
+_WHOLE = 0.998
+"""Share of the matter that is the whole."""
+
+_ROUNDS = 6
+"""Steps in which a view of the whole finds its place."""
 
 _NEAREST = 1e-9
 """Least distance of a point in front of a view that is fitted, in scene sizes."""
@@ -34,11 +44,17 @@ _BELOW_SKY = 0.8
 _OUTSIDE = 1.2
 """Least distance from the centre: everything lies within about 1 of it."""
 
-_LOWEST, _CLEAR_CELLS = 0.02, 4
-"""Least height of a pose above the ground, in scene sizes, and least number of free cells in front of it."""
+_LOWEST = 0.02
+"""Least height of a pose above the ground, in scene sizes."""
 
-_NADIR, _PITCHES = 0.4, (30.0, 65.0)
-"""Share of the poses above a scene that look straight down, and degrees below the horizon of the others."""
+_CLEAR_CELLS = 4
+"""Least number of free cells in front of a pose."""
+
+_NADIR = 0.4
+"""Share of the poses above a scene that look straight down."""
+
+_PITCHES = (30.0, 65.0)
+"""Range of the other poses' gazes in degrees below the horizon."""
 
 _OVERLAP = 5.0
 """Nadir images that show the same spot of ground, as in drone surveys."""
@@ -46,13 +62,17 @@ _OVERLAP = 5.0
 _INSET = 0.1
 """Margin that no pose aims at, as a share of the scene's sides: frames there would show the outside."""
 
-_HEIGHTS, _ABOVE = (0.85, 0.3), 1.3
-"""Smallest factor on the height of a pose, and the range above it, so that poses see at several scales; and
-least height, as a multiple of the height of what stands on the ground."""
+_HEIGHTS = (0.85, 0.3)
+"""Smallest factor on the height of a pose, and the range above it, so that poses see at several scales."""
 
-_CLEAR, _COVERED = 0.3, 0.75
-"""Share of the height that must be free in front of a pose, and of the frame that is covered for the full
-score."""
+_ABOVE = 1.3
+"""Least height, as a multiple of the height of what stands on the ground."""
+
+_CLEAR = 0.3
+"""Share of the height that must be free in front of a pose for the full score."""
+
+_COVERED = 0.75
+"""Share of the frame that is covered for the full score."""
 
 
 def plan_orbit(survey: Survey, count: int, shift: int = 0, first: int | None = None) -> Poses:

@@ -42,9 +42,11 @@ _PLANNERS: dict[str, Callable[..., Poses]] = {
     "sharp": plan_sharp,
 }
 
-_POINTS, _WORTH = 4096, 1.1
-"""Points of the scene's matter that are projected into the views to tell how many are needed, and the factor
-by which their number must grow before they are planned again."""
+_POINTS = 4096
+"""Points of the scene's matter that are projected into the views to tell how many are needed."""
+
+_WORTH = 1.1
+"""Factor by which the number of views must grow before they are planned again."""
 
 _COARSE = (0.2, 0.4)
 """Shares of the matter seen only below a pixel between which more and more poses step nearer. Measured:
@@ -60,15 +62,23 @@ _FOV = 50.0
 _STREET = 0.25
 """Share of a landscape's poses that stand on its ground, where there is room."""
 
-_SHARP, _SHARP_IN_SCALES = 0.04, 12.0
-"""Radians, and multiples of the median Gaussian's angular standard deviation: a pose from around or above is
-sharp if what it sees (`Glance.of`) is smaller than the larger of them, because a scene of few Gaussians has
-large ones. Measured: objects .007–.01, a park .012, an open scene seen through its own sky .1 and more;
-without fog 4 median Gaussians in an object, 9 and 12 in it at 12,500 and 3,000 rows."""
+_SHARP = 0.04
+"""Radians: a pose from around or above is sharp if what it sees (`Glance.of`) is smaller than this or than
+`_SHARP_IN_SCALES`. Measured: objects .007–.01, a park .012, an open scene seen through its own sky .1 and
+more."""
 
-_SAMPLED, _FEW, _MOST = 16, 0.5, 0.9
-"""Poses from around or above that are rendered first, and shares of sharp ones among them: below the first,
-no pose from there is used; above the second, all are. Between the two, each pose is rendered and judged."""
+_SHARP_IN_SCALES = 12.0
+"""Multiples of the median Gaussian's angular standard deviation, because a scene of few Gaussians has large
+ones. Measured without fog: 4 median Gaussians in an object, 9 and 12 in it at 12,500 and 3,000 rows."""
+
+_SAMPLED = 16
+"""Poses from around or above that are rendered first."""
+
+_FEW = 0.5
+"""Share of sharp poses among these below which no pose from there is used."""
+
+_MOST = 0.9
+"""Share of sharp poses above which all are used. Between the two, each pose is rendered and judged."""
 
 
 @dataclass(frozen=True, eq=False)

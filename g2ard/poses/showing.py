@@ -20,18 +20,32 @@ from g2ard.scene.splats import Splats
 _ROWS = 150_000
 """Gaussians that places are planned on, and that small pictures show."""
 
-_RISES, _TURNS = (12.0, 26.0, 40.0), 12
-"""Degrees above the horizon of views from around, and their number at each."""
+_RISES = (12.0, 26.0, 40.0)
+"""Degrees above the horizon of views from around."""
 
-_STANDING, _GAZES = 32, (-0.35, 0.15)
-"""Views within the scene that each planner proposes, and heights of their unit gazes: people look ahead."""
+_TURNS = 12
+"""Number of views from around at each of these heights."""
 
-_PLACES, _ROOFED = 256, 0.25
-"""Places, and the share of the free ones with matter above in most directions that a ceiling needs."""
+_STANDING = 32
+"""Views within the scene that each planner proposes."""
 
-_WALLED, _HORIZON, _HEIGHTS = 0.8, 0.1, (0.2, 0.6)
-"""Share of the directions up to `_HORIZON` above and below the level that meet matter between walls, and the
-range of heights of places, in heights of what stands on the ground."""
+_GAZES = (-0.35, 0.15)
+"""Heights of the unit gazes of these views: people look ahead."""
+
+_PLACES = 256
+"""Places that tell whether there is a ceiling."""
+
+_ROOFED = 0.25
+"""Share of the free places with matter above in most directions that a ceiling needs."""
+
+_WALLED = 0.8
+"""Share of the directions near the level that meet matter between walls."""
+
+_HORIZON = 0.1
+"""Largest slope of these directions, up and down."""
+
+_HEIGHTS = (0.2, 0.6)
+"""Range of heights of places, in heights of what stands on the ground."""
 
 _FINER = 0.5
 """Votes for views from around, relative to those for places between walls, below which a scene without a roof
@@ -40,27 +54,43 @@ is shown from within."""
 _PHOTOS = 64
 """Photos that are judged, at most."""
 
-_OPEN, _CRISP, _GOOD = 0.8, 0.6, 0.4
-"""Share of what all see that views from around see together, and mean share of what they show that is sharp,
-above which a scene is shown from around; and clearness of a view within that counts. Measured: objects and
-maps above .96 and .99, rooms and a hall .60 to .66, an open scene under its own sky .97 and .47."""
+_OPEN = 0.8
+"""Share of what all views see that those from around see together, above which a scene is shown from around.
+Measured: objects and maps above .96, rooms and a hall .60 to .66, an open scene under its own sky .97."""
+
+_CRISP = 0.6
+"""Mean share of what views from around show that is sharp, above which a scene is shown from around.
+Measured: objects and maps above .99, an open scene under its own sky .47."""
+
+_GOOD = 0.4
+"""Least clearness of a view within a scene that counts."""
 
 _LEAST = 0.05
 """Clearness that all views have, so that a coarse scene has some."""
 
-_AGAIN, _APART = 0.1, 60.0
-"""Worth of seeing again what an earlier view shows, and degrees between views that are different."""
+_AGAIN = 0.1
+"""Worth of seeing again what an earlier view shows."""
 
-_MIDDLE, _EDGE, _UNCUT = 0.35, 0.15, 8.0
-"""Width of the middle of photos and of their margin, in halves of the image, and the power of the share of
-the subject that is within the margin."""
+_APART = 60.0
+"""Degrees between views that are different."""
+
+_MIDDLE = 0.35
+"""Width of the middle of photos, in halves of the image."""
+
+_EDGE = 0.15
+"""Width of the margin of photos, in halves of the image."""
+
+_UNCUT = 8.0
+"""Power of the share of the subject that is within the margin."""
 
 _GAP = np.pi / 2
 """Angle without photos, radians, that a turn does not enter."""
 
-_FULL, _CLEAR = 4.0, 0.5
-"""Power of the covered share of the frame that counts in views within a scene, and the least clearness of a
-view, relative to the clearest."""
+_FULL = 4.0
+"""Power of the covered share of the frame that counts in views within a scene."""
+
+_CLEAR = 0.5
+"""Least clearness of a view, relative to the clearest."""
 
 
 @dataclass(frozen=True, eq=False)

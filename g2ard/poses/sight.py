@@ -26,14 +26,27 @@ _RAYS = (24, 18)
 _RAISED = 0.1
 """Share of `Site.tallness`: matter higher above the ground stands on it."""
 
-_PATIENCE, _TOLERABLE = 12, 0.5
-"""Candidates judged per requested pose, at most, and least score of a usable one; 1 is good."""
+_PATIENCE = 12
+"""Most candidates judged per requested pose."""
+_TOLERABLE = 0.5
+"""Least score of a usable candidate; 1 is good."""
 _BLOCK = 256
 """Candidates judged between two reports of progress, about a second; results do not depend on it."""
 
-_ROWS, SIGHT_ROWS, _OUTLOOK_ROWS, _LONGEST, _BATCH = 12_000, 24_000, 80_000, 96, 32
-"""Gaussians rendered per glance, where lines of sight matter, and to judge whole pictures; pixels along the
-longer side; and renders made together."""
+_ROWS = 12_000
+"""Gaussians rendered per glance."""
+
+SIGHT_ROWS = 24_000
+"""Gaussians rendered where lines of sight matter."""
+
+_OUTLOOK_ROWS = 80_000
+"""Gaussians rendered to judge whole pictures."""
+
+_LONGEST = 96
+"""Pixels along the longer side of a glance."""
+
+_BATCH = 32
+"""Renders made together."""
 
 _MOST_WIDENED = 4.0
 """Largest factor by which a sample of 12,000 Gaussians grows along the two longer axes, to cover for the
@@ -42,9 +55,11 @@ rest; a larger sample may grow more."""
 _CROP = 32
 """Side in pixels of the part around an aim that tells whether the line of sight is clear."""
 
-_FINE, _COARSEST = 0.03, 0.9
-"""Radians: Gaussians with a smaller angular standard deviation are detail; the rest is fog and sky. And the
-quantile of the sizes seen that counts: one tenth may be fog."""
+_FINE = 0.03
+"""Radians: Gaussians with a smaller angular standard deviation are detail; the rest is fog and sky."""
+
+_COARSEST = 0.9
+"""Quantile of the sizes seen that counts: one tenth may be fog."""
 
 _NEAR = 0.05
 """Near plane as a share of the distance within which matter is close."""

@@ -39,28 +39,41 @@ _BELOW_SKY = 0.9
 _TALL = 0.98
 """Quantile of the heights above the ground that is the height of what stands there."""
 
-_LONG, _FLAT = 1.5, 0.25
-"""Ratio of the variances along and across, above which a scene has a direction of its own, and height over
-width below which a scene with a ground is a landscape."""
+_LONG = 1.5
+"""Ratio of the variances along and across above which a scene has a direction of its own."""
 
-_BLOCKS, _LOW = 24, 0.25
-"""Blocks of ground along the longer side, each with one height: a quantile of the heights in it, because
-plants stand on the ground and noise lies below."""
+_FLAT = 0.25
+"""Height over width below which a scene with a ground is a landscape."""
 
-_TRIES, _DIRECTIONS = 4096, 64
-"""Places tried in search of rooms, and rays cast from each."""
+_BLOCKS = 24
+"""Blocks of ground along the longer side, each with one height."""
+
+_LOW = 0.25
+"""Quantile of the heights in a block that is its height: plants stand on the ground, noise lies below."""
+
+_TRIES = 4096
+"""Places tried in search of rooms."""
+
+_DIRECTIONS = 64
+"""Rays cast from each of these places."""
 
 _ENCLOSED = 0.7
 """Least share of the sphere around a place within a room that is matter; a path under open sky has half. With
 0.55 or 0.35, the showroom loses .2 and .4 dB, because some places at the edges of rooms lie behind walls."""
 
-_SHARP, _MOSTLY = 0.05, 0.75
-"""Radians, and a share: within a room, at least this share of the matter seen has a smaller standard
-deviation. Measured .013–.026; in the hollow of an object .13 and more."""
+_SHARP = 0.05
+"""Radians: within a room, most of the matter seen has a smaller standard deviation. Measured .013–.026; in
+the hollow of an object .13 and more."""
 
-_ROOMS, _SHELL = (0.005, 0.025), 0.5
+_MOSTLY = 0.75
+"""Share of the matter seen that this least asks of."""
+
+_ROOMS = (0.005, 0.025)
 """Share of the box that lies within rooms: below the first no pose stands inside, from the second on all do,
-or half of them in a scene without ground. Measured: showroom .026–.079, objects and open scenes 0.000."""
+or `_SHELL` of them in a scene without ground. Measured: showroom .026–.079, objects and open scenes 0.000."""
+
+_SHELL = 0.5
+"""Share of the poses that stand inside a scene with rooms but without ground."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,16 +11,23 @@ from g2ard.poses.matter import Matter
 from g2ard.scene.reproducible import Floats, along, fibonacci, moments, quantile
 from g2ard.scene.transform import unit_up
 
-_FACING, _SLOPED = np.cos(np.radians(20)), np.cos(np.radians(35))
-"""Least cosine between an axis and the normals that face it; and on ground, which may have slopes."""
+_FACING = np.cos(np.radians(20))
+"""Least cosine between an axis and the normals that face it."""
 
-_SHEET, _ROD = 0.08, 3.0
-"""Ratios of the scene's variances: smallest over middle below which it is flat like terrain, and largest over
-middle above which it is long."""
+_SLOPED = np.cos(np.radians(35))
+"""The same on ground, which may have slopes."""
 
-_GROUND_GIVEN, _GROUND = 0.1, 0.12
-"""Share of all matter in a layer above which it is the ground: along a given axis, and along an estimated
-one, where matter beyond the layer counts against it."""
+_SHEET = 0.08
+"""Ratio of the scene's smallest variance over its middle one below which it is flat like terrain."""
+
+_ROD = 3.0
+"""Ratio of the scene's largest variance over its middle one above which it is long."""
+
+_GROUND_GIVEN = 0.1
+"""Share of all matter in a layer above which it is the ground, along a given axis."""
+
+_GROUND = 0.12
+"""The same along an estimated axis, where matter beyond the layer counts against it."""
 
 _SLAB = 0.04
 """Half the thickness of a layer that counts as a plane, in scene sizes."""

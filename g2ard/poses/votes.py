@@ -19,26 +19,44 @@ from g2ard.system.cached import cached_property
 _FOCAL = 858.0
 """Pixels: focal length of views 800 pixels and 50° wide."""
 
-_VOTERS, _PLACES = 4096, 1024
-"""Gaussians that vote, and places that they are asked about."""
+_VOTERS = 4096
+"""Gaussians that vote."""
+
+_PLACES = 1024
+"""Places that voters are asked about."""
 
 _CLOSE = 4.0
 """Power of the share of a Gaussian's reach at which a place is tried: most are close, where matter is."""
 
-_WINNING, _CENTRAL = 0.02, 1 / 8
-"""Votes below the most with which a place still is among the best, and the share of these, nearest to matter,
-that make the centre."""
+_WINNING = 0.02
+"""Votes below the most with which a place still is among the best."""
 
-_GAP, _EMPTY = 2.0, 0.005
-"""Factor of distance within which less than this share of the scene makes a gap."""
+_CENTRAL = 1 / 8
+"""Share of the best places, nearest to matter, that make the centre."""
 
-_FITTING, _AWAY, _EYES = 0.97, 2.4, 32
-"""Share of the weight that a view from outside has in frame, its distance in radii of that share, and such
-views per hypothesis."""
+_GAP = 2.0
+"""Factor of distance that a gap spans."""
 
-_FEWEST, _LEAST, _LOST = 64, 0.05, 0.05
-"""Fewest voters and least share of the scene that are near, and largest share that lies beyond and is below
-a pixel from around what is near."""
+_EMPTY = 0.005
+"""Share of the scene within a gap, at most."""
+
+_FITTING = 0.97
+"""Share of the weight that a view from outside has in frame."""
+
+_AWAY = 2.4
+"""Distance of such a view in radii of that share."""
+
+_EYES = 32
+"""Number of such views per hypothesis."""
+
+_FEWEST = 64
+"""Fewest voters that are near."""
+
+_LEAST = 0.05
+"""Least share of the scene that is near."""
+
+_LOST = 0.05
+"""Largest share of the scene that lies beyond and is below a pixel from around what is near."""
 
 _WORSE = (1.5, 0.01)
 """Factor on the share that is lost, and addition to it, with which a wider hypothesis is as good. A limit on

@@ -11,8 +11,14 @@ from g2ard.scene.reproducible import Floats, between, directions, fibonacci, hal
 
 Reach = tuple[NDArray[np.int64], Floats, NDArray[np.bool_]]
 
-_ROOM_PITCHES, _WALK_PITCHES, _SHARP_PITCHES = (-0.3, 0.2), (-25.0, 10.0), (-35.0, 20.0)
-"""Ranges of gaze pitches above the horizon: in rooms in radians, elsewhere in degrees."""
+_ROOM_PITCHES = (-0.3, 0.2)
+"""Range of gaze pitches above the horizon in rooms, in radians."""
+
+_WALK_PITCHES = (-25.0, 10.0)
+"""Range of gaze pitches of walks, in degrees."""
+
+_SHARP_PITCHES = (-35.0, 20.0)
+"""Range of gaze pitches of sharp poses, in degrees."""
 
 _EYES = {True: (0.35, 0.75), False: (0.2, 0.6)}
 """Range of eye heights above the ground: indoors in heights of the room, outdoors in `Site.tallness`."""
@@ -29,38 +35,58 @@ _MOSTLY_INSIDE = 0.5
 _WIDE = 0.25
 """Share of the places in rooms, those with most clearance, where half of the poses stand."""
 
-_COVERED, _CLEAR_CELLS = 0.8, 4
-"""Share of the frame that is matter, and free cells in front, for the full score of a gaze in a room."""
+_COVERED = 0.8
+"""Share of the frame that is matter for the full score of a gaze in a room."""
+
+_CLEAR_CELLS = 4
+"""Free cells in front for that score."""
 
 _TRIES = (512, 2048)
 """Least and most places tried; if poses outnumber the free ones, they share them."""
 
-_WALLS, _SKY, _FLOOR = 0.7, 0.25, 0.8
-"""Least share of the directions below and around that is matter indoors; of the sky that is open outdoors,
-because with less the place is inside a hollow building; and of the ground below that is closed."""
+_WALLS = 0.7
+"""Least share of the directions below and around that is matter indoors."""
+
+_SKY = 0.25
+"""Least share of the sky that is open outdoors, because with less the place is inside a hollow building."""
+
+_FLOOR = 0.8
+"""Least share of the ground below that is closed outdoors."""
 
 _HALLS = 0.15
 """Least share of all places in a connected group that is kept; smaller groups are hollows. Without this test
 taebak 0_4 loses .3 dB, and .6 dB in standing views."""
 
-_FRAME, _THINGS = {True: 0.8, False: 0.5}, 0.12
-"""Share of the frame that is matter, and outdoors stands on the ground, for the full score of a walk."""
+_FRAME = {True: 0.8, False: 0.5}
+"""Share of the frame that is matter for the full score of a walk."""
+
+_THINGS = 0.12
+"""Share of the frame that stands on the ground for the full score of a walk outdoors."""
 
 _FULL = ((0.8, 0.3, 1.0), (0.7, 0.2, 0.8), (0.5, 0.1, 0.6))
 """Shares of the image that the scene covers, and that detail covers, and the score of a pose that exceeds
 both."""
 
-_SHARP_PATIENCE, _AIMED_PATIENCE = 8, 64
-"""Candidates per requested pose, at most: of sharp poses, and of poses anywhere."""
+_SHARP_PATIENCE = 8
+"""Most candidates per requested sharp pose."""
 
-_DISTANCES, _RISES = (0.04, 0.4), (-5.0, 35.0)
-"""Ranges around an aim: log-uniform distances in diagonals of the scene's box, and degrees up to the eye."""
+_AIMED_PATIENCE = 64
+"""Most candidates per requested pose anywhere."""
+
+_DISTANCES = (0.04, 0.4)
+"""Range of log-uniform distances from an aim, in diagonals of the scene's box."""
+
+_RISES = (-5.0, 35.0)
+"""Range of degrees from an aim up to the eye."""
 
 _CLOSE = 0.5 * _DISTANCES[0]
 """Share of the diagonal within which matter is close: half of the least distance of an aim."""
 
-_MURK, _CLEAR = 0.08, 0.35
-"""Largest share of the image that shows close matter, and least transmittance in front of the aim."""
+_MURK = 0.08
+"""Largest share of the image that shows close matter."""
+
+_CLEAR = 0.35
+"""Least transmittance in front of the aim."""
 
 _SOLID = 0.3
 """Least opacity of Gaussians that a view may aim at."""
@@ -68,9 +94,11 @@ _SOLID = 0.3
 _SAMPLE = 512
 """Points that represent the scene's matter."""
 
-_PIXELS, _STEP = 1.5, (0.25, 0.6)
-"""A near pose shows its target with this standard deviation, in pixels, within these shares of the original
-distance."""
+_PIXELS = 1.5
+"""Standard deviation in pixels with which a near pose shows its target."""
+
+_STEP = (0.25, 0.6)
+"""Range of its distance as a share of the original one."""
 
 _JITTER = 0.2
 """Scale of the random offset between a gaze and its target, as a tangent, so that not every image has the

@@ -17,8 +17,11 @@ _FINEST = 2.0
 """Pixels: seen from twice as far, a Gaussian of a smaller standard deviation is below the sampling limit."""
 _MOST = 1 / 3
 """Largest share of the views that become zooms."""
-_SAMPLE, _SOLID = 8192, 0.3
-"""Gaussians that represent the scene, and the least opacity of those that count."""
+_SAMPLE = 8192
+"""Gaussians that represent the scene."""
+
+_SOLID = 0.3
+"""Least opacity of those that count."""
 
 
 def zoomed(scene: Splats, cameras: Cameras, *, represents: float = 1.0, share: float = 1.0) -> Cameras:

@@ -130,11 +130,16 @@ def lost_detail(image: _Image, target: _Image, mask: NDArray[np.bool_] | None = 
     return float(np.quantile(lost / noticed, 0.99))
 
 
-_SEEN_CONTRAST, _MASKING = 0.015, 0.7
-"""Contrast that is just seen (Weber fraction), and exponent of its growth over a contrast that is seen."""
+_SEEN_CONTRAST = 0.015
+"""Contrast that is just seen (Weber fraction)."""
+_MASKING = 0.7
+"""Exponent of its growth over a contrast that is seen."""
 _GLARE = 0.01
 """Light that a screen reflects in a room, as a share of its white."""
-_FINE, _REGION = 9, 32
+_FINE = 9
+"""Side in pixels of the squares whose means are subtracted."""
+_REGION = 32
+"""Side in pixels of regions that are compared."""
 
 
 def _luminance(image: _Image) -> NDArray[np.float64]:
@@ -184,8 +189,11 @@ def _float32(image: _Image) -> NDArray[np.float32]:
     return np.ascontiguousarray(image, dtype=np.float32)
 
 
-_MEAN, _STD = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
-"""LPIPS's normalisation of images in [−1, 1]."""
+_MEAN = (-0.030, -0.088, -0.188)
+"""Mean of LPIPS's normalisation of images in [−1, 1]."""
+
+_STD = (0.458, 0.448, 0.450)
+"""Standard deviation of that normalisation."""
 
 _CONV = {
     "alex": {0: (4, 2), 3: (1, 2), 6: (1, 1), 8: (1, 1), 10: (1, 1)},

@@ -7,8 +7,11 @@ from numpy.typing import NDArray
 
 from g2ard.rendering.renderer import Rendered
 
-TOP, BOTTOM = (0x7D, 0x93, 0xA8), (0xC6, 0xCE, 0xD2)
-"""Colours of the sky at the upper and at the lower edge, 8 bits per channel."""
+TOP = (0x7D, 0x93, 0xA8)
+"""Colour of the sky at the upper edge, 8 bits per channel."""
+
+BOTTOM = (0xC6, 0xCE, 0xD2)
+"""Colour of the sky at the lower edge."""
 
 
 def over_sky(image: NDArray[np.float32], light: NDArray[np.float32]) -> NDArray[np.float32]:

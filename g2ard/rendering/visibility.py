@@ -17,8 +17,11 @@ from g2ard.scene.prepared import as_prepared
 from g2ard.scene.samples import evenly_spaced
 from g2ard.scene.splats import Splats
 
-MOST_VIEWS, LONGEST = 96, 300
-"""Largest number of views per scene or tile, and the longer side of their renders in pixels."""
+MOST_VIEWS = 96
+"""Largest number of views per scene or tile."""
+
+LONGEST = 300
+"""Longer side of their renders in pixels."""
 
 ROUND = 16
 """Views per round."""
@@ -29,9 +32,12 @@ _FREE_GAUSSIAN_VIEWS = 6_000_000
 NEAR = 1e-3
 """Near plane as a fraction of the cameras' median distance from the scene's centre."""
 
-_OTHER_VIEWS, _OTHER_SHARE = 32, 0.05
-"""Most views of other kinds than usual ones, and their weight relative to that of all usual views, because
-they show few Gaussians with many pixels each. Measured in decision 0040."""
+_OTHER_VIEWS = 32
+"""Most views of other kinds than usual ones."""
+
+_OTHER_SHARE = 0.05
+"""Their weight relative to that of all usual views, because they show few Gaussians with many pixels each.
+Measured in decision 0040."""
 
 CONVERGED = 0.01
 """Sampling stops after a round whose share of newly seen Gaussians is below this."""

@@ -9,8 +9,18 @@ from html import escape
 from itertools import pairwise
 
 COLORS = ("#2563eb", "#d97706", "#059669", "#db2777", "#7c3aed", "#64748b", "#0891b2", "#b91c1c", "#65a30d")
-_WIDTH, _HEIGHT = 560, 340
-_LEFT, _RIGHT, _TOP, _BOTTOM = 54, 14, 12, 44
+_WIDTH = 560
+"""Width of a chart in pixels."""
+_HEIGHT = 340
+"""Height of a chart in pixels."""
+_LEFT = 54
+"""Margin left of the axes in pixels."""
+_RIGHT = 14
+"""Margin right of the axes in pixels."""
+_TOP = 12
+"""Margin above the axes in pixels."""
+_BOTTOM = 44
+"""Margin below the axes in pixels."""
 
 
 @dataclass(frozen=True)

@@ -9,8 +9,14 @@ from pathlib import Path
 from g2ard.io.source import Source
 from g2ard.progress import plural
 
-TARGET, DENSE, RESULT = "target", "dense scene", "result"
-"""Words for what renders are compared with, what is distilled, and what comes of it."""
+TARGET = "target"
+"""Word for what renders are compared with."""
+
+DENSE = "dense scene"
+"""Words for what is distilled."""
+
+RESULT = "result"
+"""Word for what comes of it."""
 
 _GENERIC = re.compile(
     r"(scene|points?(_?cloud|3d)?|cloud|splats?|gaussians?|model|output|result|simplified|(lod-)?meta|tileset|"

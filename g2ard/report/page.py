@@ -16,7 +16,10 @@ from g2ard.io.atomic import atomic_output
 from g2ard.io.images import to_bytes
 from g2ard.report.labels import TARGET
 
-_WINDOW, _CROPS = 0.28, 2  # side of an automatic crop as a share of the image's, and number of crops
+_WINDOW = 0.28
+"""Side of an automatic crop as a share of the image's."""
+_CROPS = 2
+"""Number of automatic crops."""
 _LONGEST = 1280
 _QUALITY = 86
 _HERE = Path(__file__).parent

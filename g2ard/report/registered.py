@@ -19,7 +19,10 @@ from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats
 from g2ard.stages.register.report import PhotoReport, Registered
 
-_VIEWS, _SIZE = 12, 640  # number of photos shown, and the longer side of their images in pixels
+_VIEWS = 12
+"""Number of photos shown."""
+_SIZE = 640
+"""Longer side of their images in pixels."""
 _LINES = 80  # matches drawn per photo
 
 

@@ -18,8 +18,11 @@ from g2ard.scene.samples import evenly_spaced
 from g2ard.system.keys import UNKEYED, key_of, keyed
 from g2ard.system.shown import Shown
 
-USUAL, ZOOM = "usual", "zoom"
-"""Kinds of views that state none (given views, and the poses that suit the scene), and of enlarged parts."""
+USUAL = "usual"
+"""Kind of views that state none: given views, and the poses that suit the scene."""
+
+ZOOM = "zoom"
+"""Kind of views of enlarged parts."""
 
 LARGEST_IMAGE = 160_000_000
 """Maximum pixels of an image or view; a decoded pixel takes 12 bytes."""

@@ -25,8 +25,11 @@ _UNIT_SLACK = 1e-6  # deviation of a quaternion's length from 1 that counts as r
 _FINE_STEP = 1e-4  # rounding of positions that nothing shows, as a share of a Gaussian's scale
 _COLOR_SLACK = 1e-5  # excess of a colour over [0, 1] that counts as rounding
 
-_FAR_SPREADS, _SAMPLE = 16.0, 65_536
-"""Distance from the origin, in spreads, beyond which points are far; number of points that decide."""
+_FAR_SPREADS = 16.0
+"""Distance from the origin, in spreads, beyond which points are far."""
+
+_SAMPLE = 65_536
+"""Number of points that decide."""
 
 ARRAYS = ("means", "quats", "scales", "logit_opacities", "sh0", "shN")
 """Names of the arrays with a row per Gaussian."""

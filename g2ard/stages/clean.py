@@ -41,8 +41,10 @@ _FOOTPRINT_SIGMAS = 3.0
 """Standard deviations at which renderers cut off a footprint."""
 _FLOATER_SHARE = 1e-3
 """Share of the scene's Gaussians and of its light below which a separate group is a floater."""
-_NEIGHBORS, _BLOCK = 16, 1 << 17
-"""Nearest neighbours that can touch a Gaussian, and Gaussians that are grouped at once."""
+_NEIGHBORS = 16
+"""Nearest neighbours that can touch a Gaussian."""
+_BLOCK = 1 << 17
+"""Gaussians that are grouped at once."""
 _SURFACE_SLACK = 0.01
 """Share of the depth within which a Gaussian belongs to the visible surface, behind or in front of it."""
 

@@ -42,8 +42,11 @@ _TELL: ContextVar[Callable[[float], None]] = ContextVar("tell", default=lambda s
 _TELL_SECONDS = 0.5
 """Least time between two shares in a task's file."""
 
-_CROP_SAMPLE, _CROP_MARGIN = 20_000, 8
-"""Number of means that outline a tile for cropping, and the pixels kept around them."""
+_CROP_SAMPLE = 20_000
+"""Number of means that outline a tile for cropping."""
+
+_CROP_MARGIN = 8
+"""Pixels kept around these means."""
 
 _OUTPUT_VERSION = 5
 """Version of the functions' output; raise it when a change makes earlier files unusable."""

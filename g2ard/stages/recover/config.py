@@ -32,9 +32,14 @@ _UNTRAINED_RMSE = 0.1
 _SIGHT_SAMPLE = 4096
 """Gaussians that `steps_for` measures views with."""
 
-_USUAL_VIEWS, _MOST_GROWTH, VIEWS_PER_SCHEDULE = 112, 2.25, 140
-"""Usual views that train if each holds the whole scene, the largest factor if it holds less, and the views
-that the schedule's steps are for."""
+_USUAL_VIEWS = 112
+"""Usual views that train if each holds the whole scene."""
+
+_MOST_GROWTH = 2.25
+"""Largest factor on these if each holds less."""
+
+VIEWS_PER_SCHEDULE = 140
+"""Views that the schedule's steps are for."""
 
 _FEW_POINTS = 1250
 """Points of photos up to which the schedule's steps suffice."""

@@ -59,9 +59,11 @@ def typical_share(splats: Splats, cameras: Cameras) -> float:
     return float(np.median(shares)) if len(shares) else 0.0
 
 
-TYPICAL_LOSS, LEAST_LOSS = 0.02, 0.005
-"""Loss to which the gradients of views are scaled if they count alike, and the loss below which errors are
-invisible, about 40 dB."""
+TYPICAL_LOSS = 0.02
+"""Loss to which the gradients of views are scaled if they count alike."""
+
+LEAST_LOSS = 0.005
+"""Loss below which errors are invisible, about 40 dB."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -30,8 +30,11 @@ _TOLERATED_LOSS = 0.1
 """Loss in dB that is tolerated in a kind of validation views."""
 _LEAST_GAIN = 0.05
 """Gain in dB below which a change is not worth keeping."""
-_VALIDATION_FROM, _VALIDATION_LOSS = 0.5, 0.5
-"""Share of the horizon from which validation views can stop a run, and the loss in dB above which they do."""
+_VALIDATION_FROM = 0.5
+"""Share of the horizon from which validation views can stop a run."""
+
+_VALIDATION_LOSS = 0.5
+"""Loss in dB above which they do."""
 
 _STATE = ("looked", "backed_off", "stopped", "best_score", "validation", "scores")
 _BEST = "best."

@@ -11,12 +11,19 @@ _EQUAL_GAIN_SHARE = 0.05
 """Share of the best gain within which other gains count as equal to it."""
 _LEAST_MULTIPLIER = 0.01
 """Multiplier below which no smaller one is tried: they change nothing visible in 8 bits."""
-_TRIAL_STEPS, _LIMITED_STEPS, _SHORTEST_HORIZON = (10, 60), 20, 100
-"""Steps of a trial: fewest and most, and under a time limit; and the shortest horizon with trials."""
+_TRIAL_STEPS = (10, 60)
+"""Fewest and most steps of a trial."""
+_LIMITED_STEPS = 20
+"""Most steps of a trial under a time limit."""
+_SHORTEST_HORIZON = 100
+"""Shortest horizon with trials, in steps."""
 _TRIAL_DIVISOR = 50
 """Share of the horizon that one trial takes, as a divisor."""
-_TRIAL_TIME_SHARE, _CALM_TRIAL_TIME_SHARE = 0.1, 0.3
-"""Shares of a time limit for all trials: usually, and if rates are too large."""
+_TRIAL_TIME_SHARE = 0.1
+"""Share of a time limit for all trials, usually."""
+
+_CALM_TRIAL_TIME_SHARE = 0.3
+"""The same if rates are too large."""
 
 
 class Trials:

@@ -18,8 +18,10 @@ _MOST_PIXELS = 64.0
 """Most light in pixels that counts per Gaussian and view: more shows nothing new."""
 _RENDER_SIDE = 240
 """Longer side in pixels of the renders that measure light."""
-_SAMPLED_ROWS, _SAMPLED_VIEWS = 50_000, 64
-"""Gaussians, and given views, that represent all."""
+_SAMPLED_ROWS = 50_000
+"""Gaussians that represent all."""
+_SAMPLED_VIEWS = 64
+"""Given views that represent all."""
 _BATCH = 32
 """Views rendered together."""
 

@@ -21,7 +21,8 @@ _USUAL_RATIO = 10.0
 _CORE = _core.defaults()
 """Defaults of the Rust core, by method."""
 
-_PAIRWISE, _PAPER = _CORE["default"], _CORE["paper"]
+_PAIRWISE = _CORE["default"]
+_PAPER = _CORE["paper"]
 
 
 @dataclass(frozen=True)

@@ -17,8 +17,11 @@ from g2ard.system.threads import in_threads
 _GAPS = 0.02
 """Least share of opacity lost that shows as gaps."""
 
-_VIEWS, _PIXELS = 8, 400
-"""Views in which it is measured, and their longer side."""
+_VIEWS = 8
+"""Views in which coverage is measured."""
+
+_PIXELS = 400
+"""Longer side of these views in pixels."""
 
 _OPAQUE = 0.9
 """Least opacity of a pixel that counts as opaque."""
