@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 
-from g2ard.errors import MissingDependencyError
+from g2ard.errors import explained
 from g2ard.system import interrupt
 
 __all__ = ["main"]
@@ -14,8 +14,8 @@ def main() -> None:
     interrupt.ends_the_program()
     try:
         from benchmarks.commands import app
-    except MissingDependencyError as e:
-        sys.exit(f"benchmarks: {e}")
+    except ImportError as error:
+        sys.exit(f"benchmarks: {explained(error)}")
     from g2ard.cli.main import run_program
 
     run_program(app, "benchmarks")

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from g2ard import _core
+import g2ard._core as _core
 from g2ard.config import choices
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats

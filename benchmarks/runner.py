@@ -5,9 +5,9 @@ from __future__ import annotations
 import hashlib
 import json
 import shutil
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -18,24 +18,7 @@ from g2ard import __version__
 from g2ard.errors import G2ardError
 from g2ard.progress import Progress, Say, silent, unsaid
 
-__all__ = ["Cell", "fingerprint", "folder_of", "run", "scene_key"]
-
-
-@dataclass(frozen=True)
-class Cell:
-    """A measurement.
-
-    Args:
-        names: columns that identify it among the cells of a study and scene.
-        measure: function that returns its rows, without those columns.
-        views: kinds of views with a row each; empty allows any rows.
-        more: other values that the result depends on.
-    """
-
-    names: Mapping[str, Any]
-    measure: Callable[[], Iterable[Row]]
-    views: tuple[str, ...] = ()
-    more: Any = None
+__all__ = ["fingerprint", "folder_of", "run", "scene_key"]
 
 
 def run(

@@ -7,7 +7,7 @@ import os
 import re
 import tomllib
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import MISSING, Field, dataclass, field, fields, replace
 from importlib import import_module
 from pathlib import Path
@@ -17,9 +17,8 @@ from g2ard.errors import InputError, require_torch
 
 if TYPE_CHECKING:
     from benchmarks.rows import Row
-    from benchmarks.runner import Cell
 
-__all__ = ["DEFINITIONS", "SceneSpec", "Study", "checked", "key", "read_study", "scene_label"]
+__all__ = ["DEFINITIONS", "Cell", "SceneSpec", "Study", "checked", "key", "read_study", "scene_label"]
 
 DEFINITIONS = Path(__file__).parent / "definitions"
 KINDS = ("matched", "simplify", "recover", "select", "ship", "register", "raster", "boxes", "devices")
@@ -100,6 +99,23 @@ class SceneSpec:
     def __post_init__(self) -> None:
         if self.adapt_last and (self.adapt is not None or self.train is None):
             raise InputError("adapt_last needs a scene with `train` and without `adapt`")
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A measurement.
+
+    Args:
+        names: columns that identify it among the cells of a study and scene.
+        measure: function that returns its rows, without those columns.
+        views: kinds of views with a row each; empty allows any rows.
+        more: other values that the result depends on.
+    """
+
+    names: Mapping[str, Any]
+    measure: Callable[[], Iterable[Row]]
+    views: tuple[str, ...] = ()
+    more: Any = None
 
 
 @dataclass(frozen=True)

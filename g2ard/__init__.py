@@ -38,6 +38,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from g2ard.system.shown import Shown
+
 if TYPE_CHECKING:
     from g2ard._core import __version__
     from g2ard.errors import G2ardError, InputError, MissingDependencyError, OutputError
@@ -200,8 +202,6 @@ _ALIASES = {
 
 
 def __getattr__(name: str) -> Any:
-    if name == "_core":
-        return _extension()
     home, own = _ALIASES.get(name, (next((m for m, names in _HOMES.items() if name in names), None), name))
     if home is None:
         raise AttributeError(f"module 'g2ard' has no attribute {name!r}")
@@ -211,7 +211,12 @@ def __getattr__(name: str) -> Any:
         require_torch("g2ard.rasterize")
     from importlib import import_module
 
-    found = getattr(_extension() if home == "_core" else import_module(f"g2ard.{home}"), own)
+    try:
+        found = getattr(import_module(f"g2ard.{home}"), own)
+    except ModuleNotFoundError as error:
+        from g2ard.errors import explained
+
+        raise explained(error) from None
     if type(found) is type(__getattr__):
         from g2ard.config.checks import checks_arguments
 
@@ -220,22 +225,13 @@ def __getattr__(name: str) -> Any:
     return found
 
 
-def _extension() -> Any:
-    """Import `g2ard._core`, which is missing from a checkout until it is built."""
-    from importlib import import_module
+def _html_of(shown: Any) -> str:
+    from g2ard.jobs.notebook import html_of
 
-    try:
-        return import_module("g2ard._core")
-    except ModuleNotFoundError:
-        from pathlib import Path
+    return html_of(shown)
 
-        from g2ard.errors import MissingDependencyError
 
-        raise MissingDependencyError(
-            "this checkout has no Rust extension, and Python prefers it to an installed g2ard",
-            path=Path(__file__).parents[1],
-            hint="run `pip install -e .` or `make setup` there, or start Python in another folder",
-        ) from None
+Shown._html_of = _html_of
 
 
 def __dir__() -> list[str]:

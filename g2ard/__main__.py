@@ -19,12 +19,12 @@ def main() -> None:
         if end.code in interrupt.STATUSES:
             interrupt.leave()
         raise
-    except ImportError as e:
-        from g2ard.errors import MissingDependencyError
+    except ImportError as error:
+        if error.name != "g2ard._core":
+            raise
+        from g2ard.errors import explained
 
-        if isinstance(e, MissingDependencyError):  # the extension's: those of commands are caught there
-            sys.exit(f"g2ard: {e}")
-        raise
+        sys.exit(f"g2ard: {explained(error)}")
 
 
 if __name__ == "__main__":

@@ -135,6 +135,17 @@ def missing(what: str, package: str, **fields: Any) -> MissingDependencyError:
     )
 
 
+def explained(error: ImportError) -> ImportError:
+    """Return the error for a checkout whose Rust extension is not built, or another error as it is."""
+    if error.name != "g2ard._core":
+        return error
+    return MissingDependencyError(
+        "this checkout has no Rust extension, and Python prefers it to an installed g2ard",
+        path=Path(__file__).parents[1],
+        hint="run `pip install -e .` or `make setup` there, or start Python in another folder",
+    )
+
+
 def require_torch(feature: str) -> None:
     """Check that torch can be imported, without importing it."""
     if find_spec("torch") is None:

@@ -337,7 +337,7 @@ def run_all(chosen: list[Case], root: Path, jobs: int, isa: str | None) -> dict[
     """Run cases, `jobs` at a time, and return their lines of the record."""
     importlib.import_module("g2ard.__main__")
     import g2ard
-    from g2ard import _core
+    import g2ard._core as _core
 
     if isa:
         for name in ("Rasterizer", "Trainer"):

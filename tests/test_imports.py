@@ -133,6 +133,21 @@ def test_no_import_cycles(crate: str) -> None:
     assert not edges
 
 
+def test_modules_are_imported_by_their_own_names() -> None:
+    """`from g2ard.io import judge` would import all that the package's face imports."""
+    known = modules()
+    faces = {name for name, path in known.items() if path.name == "__init__.py" and [*imported(path)]}
+    wrong = [
+        f"{module} imports {node.module}.{alias.name}"
+        for module, path in known.items()
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, ast.ImportFrom) and node.module in faces
+        for alias in node.names
+        if f"{node.module}.{alias.name}" in {*known, "g2ard._core"}
+    ]
+    assert wrong == []
+
+
 def test_stages_do_not_import_each_other() -> None:
     stages = {name: path for name, path in modules().items() if name.startswith("g2ard.stages.")}
     own = {name: ".".join(name.split(".")[:3]) for name in stages}

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from g2ard import _core
+import g2ard._core as _core
 from g2ard.rendering.renderer import arrays_of, centred, settings_for, view_of
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats

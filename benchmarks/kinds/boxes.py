@@ -12,8 +12,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from benchmarks.rows import Row
-from benchmarks.runner import Cell
-from benchmarks.study import SceneSpec, Study, key
+from benchmarks.study import Cell, SceneSpec, Study, key
 from benchmarks.workspace import Workspace
 from g2ard.rendering.boxes import FAINT, Canvas, front_to_back, reaching
 from g2ard.rendering.renderer import Renderer, settings_for

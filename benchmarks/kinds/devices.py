@@ -11,15 +11,14 @@ from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
 
+import g2ard._core as _core
 from benchmarks.baselines import mcmc
 from benchmarks.kinds.raster import GPU, built_in_view, drawn, timed_step
 from benchmarks.process import measured
 from benchmarks.rows import Row
-from benchmarks.runner import Cell
 from benchmarks.score import figures, score
-from benchmarks.study import SceneSpec, Study, key
+from benchmarks.study import Cell, SceneSpec, Study, key
 from benchmarks.workspace import Workspace, budget_of
-from g2ard import _core
 from g2ard.errors import InputError
 from g2ard.system import devices
 

@@ -24,9 +24,9 @@ from benchmarks.kinds.methods import METHODS, ROUND_STEPS, Budget, Leg, MethodSp
 from benchmarks.kinds.worker import StoredTargets, store_targets
 from benchmarks.process import Usage, measured, splat_transform
 from benchmarks.rows import Row
-from benchmarks.runner import Cell, fingerprint
+from benchmarks.runner import fingerprint
 from benchmarks.score import figures, pictured, save_jpeg, score
-from benchmarks.study import SceneSpec, Study, key
+from benchmarks.study import Cell, SceneSpec, Study, key
 from benchmarks.workspace import Workspace, budget_of
 from g2ard import __version__, io
 from g2ard.config.choices import ADAPT_SCHEDULES, CONVENTIONS, ENGINES, LPIPS_INPUTS, SCHEDULE_NAMES

@@ -11,11 +11,10 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+import g2ard._core as _core
 from benchmarks.rows import Row
-from benchmarks.runner import Cell
-from benchmarks.study import SceneSpec, Study, key
+from benchmarks.study import Cell, SceneSpec, Study, key
 from benchmarks.workspace import Workspace
-from g2ard import _core
 from g2ard.errors import InputError
 from g2ard.progress import plural
 from g2ard.rendering.renderer import RasterSettings, arrays_of, view_of

@@ -13,9 +13,8 @@ import numpy as np
 
 from benchmarks.baselines import mcmc
 from benchmarks.rows import Row
-from benchmarks.runner import Cell
 from benchmarks.score import figures, score
-from benchmarks.study import SceneSpec, Study, key
+from benchmarks.study import Cell, SceneSpec, Study, key
 from benchmarks.workspace import PROTOCOLS, Workspace, budget_of, kinds_for
 from g2ard.config.choices import ENGINES
 from g2ard.errors import InputError

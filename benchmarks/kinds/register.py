@@ -13,8 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.rows import Row
-from benchmarks.runner import Cell
-from benchmarks.study import SceneSpec, Study, key
+from benchmarks.study import Cell, SceneSpec, Study, key
 from benchmarks.workspace import Workspace, reduced
 from g2ard import io
 from g2ard.config.choices import Keep

@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 
 from benchmarks.policies import order_views
 from benchmarks.rows import Row
-from benchmarks.runner import Cell
-from benchmarks.study import SceneSpec, Study, key
+from benchmarks.study import Cell, SceneSpec, Study, key
 from benchmarks.workspace import Workspace
 from g2ard.config.choices import ENGINES, Engine
 from g2ard.io.splits import splits_of, states_splits

@@ -12,9 +12,8 @@ from typing import Any, ClassVar
 
 from benchmarks.process import measured, splat_transform
 from benchmarks.rows import Row
-from benchmarks.runner import Cell
 from benchmarks.score import figures, score
-from benchmarks.study import SceneSpec, Study
+from benchmarks.study import Cell, SceneSpec, Study
 from benchmarks.workspace import Workspace, reduced
 from g2ard import io
 from g2ard.io.scene_formats import FORMATS

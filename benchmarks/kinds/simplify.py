@@ -16,9 +16,8 @@ from benchmarks import baselines
 from benchmarks.kinds.methods import REDUCERS
 from benchmarks.process import Usage, measured, splat_transform, version_of
 from benchmarks.rows import Row
-from benchmarks.runner import Cell
 from benchmarks.score import figures, score
-from benchmarks.study import SceneSpec, Study, key
+from benchmarks.study import Cell, SceneSpec, Study, key
 from benchmarks.workspace import PROTOCOLS, Workspace, budget_of, kinds_for
 from g2ard import io
 from g2ard.scene.splats import Splats

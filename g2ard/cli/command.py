@@ -204,7 +204,7 @@ def _execute(run: Run, fn: Callable[..., None], options: dict[str, Any]) -> None
         if run.json not in (None, "-"):
             run.claim_file("--json", Path(str(run.json)))
         if run.threads:
-            from g2ard import _core
+            import g2ard._core as _core
 
             _core.set_num_threads(run.threads)
             os.environ["RAYON_NUM_THREADS"] = str(run.threads)  # for child processes

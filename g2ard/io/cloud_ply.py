@@ -7,7 +7,7 @@ import numpy as np
 from numpy.lib.recfunctions import unstructured_to_structured
 
 from g2ard.errors import InputError
-from g2ard.io import judge
+from g2ard.io.judge import full_scales, unpacked
 from g2ard.io.plyfiles import (
     COLOR_NAMES,
     is_mesh,
@@ -54,7 +54,7 @@ class Stream(PointStream):
 
         self._names, sample = telling(choices, sampled)
         packed = self._names and self._names[0] in _PACKED
-        scales = [(255.0,)] if packed else [judge.full_scales(kinds[name]) for name in self._names]
+        scales = [(255.0,)] if packed else [full_scales(kinds[name]) for name in self._names]
         widest = max(scales, key=lambda scales: scales[-1], default=(1.0,))
         super().__init__(path, len(self._vertices), sample, widest)
         if not choices:
@@ -74,7 +74,7 @@ class Stream(PointStream):
         if len(columns) == 3:
             columns = [_color(self.path, c, name) for c, name in zip(columns, self._names, strict=True)]
         elif columns and self._names[0] in _PACKED:
-            columns = judge.unpacked(columns[0])
+            columns = unpacked(columns[0])
         columns += [rows[self._named[name]] for name in self.also]
         noise = np.zeros(len(rows), bool)
         with np.errstate(invalid="ignore", over="ignore"):  # a signalling NaN
@@ -84,7 +84,7 @@ class Stream(PointStream):
 
 def _color(path: Path, values: Values, name: str) -> Float32:
     finite = values[np.isfinite(values)] if values.dtype.kind == "f" else values
-    scales = judge.full_scales(values.dtype)
+    scales = full_scales(values.dtype)
     low, top = float(finite.min(initial=0)), float(finite.max(initial=0))
     if low < (-0.5 if values.dtype.kind == "f" else 0) or top > scales[-1] * 1.001:
         beyond = low if low < 0 else top

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from g2ard.config.choices import RenderModel
 from g2ard.errors import InputError
-from g2ard.io import plyfiles
 from g2ard.io.atomic import atomic_output
 from g2ard.io.packing import (
     coded,
@@ -24,6 +23,17 @@ from g2ard.io.packing import (
     smallest_three,
     unit_quats,
     writable,
+)
+from g2ard.io.plyfiles import (
+    axes_of,
+    comments_of,
+    offset_of,
+    read_element,
+    read_header,
+    render_model_of,
+    require,
+    row_blocks,
+    up_of,
 )
 from g2ard.io.sanitize import Raw, logits_of
 from g2ard.io.stream import RawStream
@@ -52,27 +62,27 @@ class Stream(RawStream):
     """Scene in blocks; memory holds all chunk bounds, 144 bytes per 256 Gaussians."""
 
     def __init__(self, path: Path) -> None:
-        header = plyfiles.read_header(path)
-        plyfiles.require(header.properties("vertex"), _PACKED, "a compressed scene")
+        header = read_header(path)
+        require(header.properties("vertex"), _PACKED, "a compressed scene")
         chunk_properties = header.properties("chunk")
         bounds = _BOUNDS if "min_r" in chunk_properties else _BOUNDS[:12]  # older files: colours over [0, 1]
-        plyfiles.require(chunk_properties, bounds, "a compressed scene", "chunk")
+        require(chunk_properties, bounds, "a compressed scene", "chunk")
         rest = [p for p in header.properties("sh") if re.fullmatch(r"f_rest_\d+", p)]
         if len(rest) not in (0, 9, 24, 45) or set(rest) != {f"f_rest_{k}" for k in range(len(rest))}:
             raise InputError(f"element 'sh' has {len(rest)} coefficients; expected 9, 24 or 45")
 
         names = ("vertex", "chunk", "sh") if rest else ("vertex", "chunk")
-        vertex, chunk, *sh = plyfiles.read_element(path, header, *names)
+        vertex, chunk, *sh = read_element(path, header, *names)
         if len(chunk) * _CHUNK_ROWS < len(vertex) or (sh and len(sh[0]) != len(vertex)):
             raise InputError(f"{len(chunk)} chunks and {plural(len(vertex), 'Gaussian')} do not fit")
         for name in _PACKED:
             if vertex.dtype[name] != np.uint32:
                 raise InputError(f"has type {vertex.dtype[name]}, expected uint", property=name)
-        offset, mode = plyfiles.offset_of(header), plyfiles.render_model_of(header.comments)
+        offset, mode = offset_of(header), render_model_of(header.comments)
         model: RenderModel = "antialiased" if mode == "antialiased" else "classic"
         super().__init__(path, len(vertex), len(rest) // 3, offset, render_model=model)
-        self.up = plyfiles.up_of(header.comments)
-        self.restore(plyfiles.axes_of(header))
+        self.up = up_of(header.comments)
+        self.restore(axes_of(header))
         self._vertex, self._sh, self._rest = vertex, sh[0] if sh else None, len(rest) // 3
         self._bounds = np.tile([[0.0] * 3, [1.0] * 3], (len(chunk), 3, 1, 1))
         stored = structured_to_unstructured(np.asarray(chunk)[bounds]).reshape(len(chunk), -1, 2, 3)
@@ -81,8 +91,8 @@ class Stream(RawStream):
     def raw(self, rows: int, start: int) -> Iterator[Raw]:
         bands: Iterator[Any] = repeat((0, None))
         if self._sh is not None:
-            bands = plyfiles.row_blocks(self.path, self._sh, rows, start)
-        vertices = plyfiles.row_blocks(self.path, self._vertex, rows, start)
+            bands = row_blocks(self.path, self._sh, rows, start)
+        vertices = row_blocks(self.path, self._vertex, rows, start)
         for (first, vertex), (_, sh) in zip(vertices, bands, strict=False):
             yield self._decode(first, vertex, sh)
 
@@ -144,7 +154,7 @@ def write(path: Path, splats: Splats, *, overwrite: bool = False) -> float:
     elements = [PlyElement.describe(chunk, "chunk"), PlyElement.describe(words, "vertex")]
     if splats.sh_degree:
         elements.append(PlyElement.describe(_harmonics(splats), "sh"))
-    comments = plyfiles.comments_of(splats)
+    comments = comments_of(splats)
     with atomic_output(path, overwrite) as temporary, temporary.open("wb") as file:
         PlyData(elements, byte_order="<", comments=comments).write(file)
     stored = _between(means, 0, _unpacked(words["packed_position"], _VECTOR_BITS))

@@ -104,6 +104,12 @@ MANIFEST = "tiles.json"
 POINTS = ".points"
 """Their folder of points to lift."""
 
+_CLOUDS = (".las", ".laz", ".e57", ".pcd", ".ply")
+"""Suffixes of files that a folder of clouds may hold."""
+
+_BESIDE = (".lax", ".lasx", ".copc", ".prj", ".wkt", ".xml", ".txt", ".md", ".pdf", ".json")
+"""Suffixes of files that surveys keep beside their clouds."""
+
 _MOST_INSPECTED_FILES = 64  # maximum files of a folder to inspect for suggestions
 _MOST_SEARCHED_FILES = 256  # maximum files of a folder and those below to look for signs of other programs
 
@@ -140,7 +146,7 @@ def file_format(path: AnyPath) -> str:
 
 def reader(path: Path, name: str, expected: Kind) -> Any:
     """Return the module that reads a file or folder of a format; reject one of another kind."""
-    from g2ard.io import plyfiles
+    import g2ard.io.plyfiles as plyfiles
 
     found = KINDS[name]
     if expected == "points" and name == "colmap":
@@ -285,7 +291,10 @@ def find_views(scene: AnyPath) -> Path | None:
 
 def _cameras_of(own: Path) -> Iterator[Path]:
     """Yield the cameras of a scene in a folder, the best first."""
-    from g2ard.io import gsplat_run, inria, nerfstudio, nerfstudio_export
+    import g2ard.io.gsplat_run as gsplat_run
+    import g2ard.io.inria as inria
+    import g2ard.io.nerfstudio as nerfstudio
+    import g2ard.io.nerfstudio_export as nerfstudio_export
 
     iteration = re.fullmatch(r"iteration_\d+", own.name) and own.parent.name == "point_cloud"
     places = [own / inria.NAME, *([own.parent.parent / inria.NAME] if iteration else ())]
@@ -326,9 +335,23 @@ def _folder_format(path: Path) -> str:
         raise InputError("has unfinished tiles", path=path, hint="run the same `g2ard ingest` again")
     if error := incomplete(path):
         raise error
-    if import_module("g2ard.io.clouds").holds(path):
+    if _holds_clouds(path):
         return "clouds"
     raise InputError(_unsupported(path), path=path)
+
+
+def clouds_in(folder: Path) -> list[Path]:
+    """Return the clouds of a folder of clouds alone, by name; an empty list for another folder."""
+    files = [file for file in sorted(folder.iterdir()) if not file.name.startswith(".")]
+    clouds = [file for file in files if file.suffix.lower() in _CLOUDS]
+    others = [file for file in files if file.suffix.lower() not in (*_CLOUDS, *_BESIDE)]
+    return [] if others else clouds
+
+
+def _holds_clouds(folder: Path) -> bool:
+    """Return whether a folder holds point clouds and nothing else; the first few are looked into."""
+    clouds = clouds_in(folder)
+    return bool(clouds) and all(kind(file) == "points" for file in islice(clouds, 4))
 
 
 def _by_gsplat(folder: Path) -> bool:
@@ -426,7 +449,8 @@ def _photos_in(folder: Path) -> list[Path]:
 
 def _poses_above(path: Path) -> Path | None:
     """Return the transforms.json, or the folder of another file of poses, beside a folder of photos."""
-    from g2ard.io import colmap, transforms
+    import g2ard.io.colmap as colmap
+    import g2ard.io.transforms as transforms
 
     above = path.parent
     files = transforms.files_of(above)

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 
 from g2ard.errors import G2ardError, InputError, missing
-from g2ard.io import judge
 from g2ard.io.atomic import atomic_output
+from g2ard.io.judge import full_scales
 from g2ard.io.paths import check_unpacked, file_identity, user_cache
 from g2ard.io.photos import Frame, Lens, Listed, inverse, posed
 from g2ard.io.stream import JoinedClouds, MarkedPoints, Names, PointStream, telling
@@ -95,7 +95,7 @@ class _Scan(PointStream):
         choices = [fields for fields in (_COLORS, _INTENSITY) if names.issuperset(fields)]
         self._color, sample = telling(choices, self._sampled)
         limits = _limits(header, "intensity") if self._color == _INTENSITY else None
-        scales = judge.full_scales(np.dtype(float))
+        scales = full_scales(np.dtype(float))
         super().__init__(path, self.count, sample, scales, limits)
         self.axes = "RFU"
         if self.channels == 3 and (stated := _limits(header, "colorRed")):

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from g2ard.errors import InputError, damaged
-from g2ard.io import judge
+from g2ard.io.judge import full_scales
 from g2ard.io.paths import about, check_unpacked
 from g2ard.io.stream import MarkedPoints, Names, PointStream, telling
 from g2ard.io.types import Note
@@ -55,7 +55,7 @@ class Stream(PointStream):
             return [_points(run, color) for run in runs] or [_NOTHING]
 
         self._color, sample = telling(choices, sampled)
-        super().__init__(path, count, sample, judge.full_scales(np.dtype(np.uint16)), notes=notes)
+        super().__init__(path, count, sample, full_scales(np.dtype(np.uint16)), notes=notes)
         self.system, self.axes, self.metres_per_unit = system, "RFU", metres_per_unit
         if choices[0] != _RGB:
             number = header.point_format.id

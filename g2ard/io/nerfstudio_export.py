@@ -5,8 +5,9 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
+import g2ard.io.colmap as colmap
+import g2ard.io.transforms as transforms
 from g2ard.errors import InputError
-from g2ard.io import colmap, transforms
 from g2ard.io.finding import Finder
 from g2ard.io.jsonfile import Place, Pose, checked, read_any_json
 from g2ard.io.photos import Frame, Lens, Listed, rigid

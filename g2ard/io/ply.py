@@ -7,9 +7,10 @@ from pathlib import Path
 import numpy as np
 from numpy.lib.recfunctions import structured_to_unstructured
 
+import g2ard.io.plyfiles as plyfiles
 from g2ard.config.choices import PlyLayout, RenderModel
 from g2ard.errors import InputError, require
-from g2ard.io import judge, plyfiles
+from g2ard.io.judge import Reading, coarse, full_scales, judged, spacing, white
 from g2ard.io.packing import rounding
 from g2ard.io.sanitize import BLOCK, LOG_SCALE_LIMIT, Raw
 from g2ard.io.stream import RawStream, SceneStream
@@ -111,7 +112,7 @@ class Stream(RawStream):
         means = self._columns(block, _MEANS)
         return np.asarray(means - self._shift if self._shift.any() else means, np.float32)
 
-    def _judged(self) -> tuple[judge.Reading, float]:
+    def _judged(self) -> tuple[Reading, float]:
         """Return how values are stored, and the number that means white in RGB."""
         rows = plyfiles.spread_rows(self._rows, _JUDGED)
         scales, base = self._columns(rows, self._scales), self._columns(rows, self._rgb or _DC)
@@ -119,12 +120,12 @@ class Stream(RawStream):
         with np.errstate(over="ignore", invalid="ignore"):
             wide = 2 * np.exp(np.median(scales)) if len(rows) else 0.0
         means = self._columns(rows, _MEANS)
-        self.notes += judge.coarse(means, float(wide))
-        apart = judge.spacing(means, self.count)
+        self.notes += coarse(means, float(wide))
+        apart = spacing(means, self.count)
         if self._rgb is None:
-            return judge.judged(scales, opacities, base, logs=True, apart=apart), 1.0
-        full = judge.white(base, judge.full_scales(base.dtype))
-        return judge.judged(scales, opacities, np.zeros((0, 3)), logs=True, apart=apart), full
+            return judged(scales, opacities, base, logs=True, apart=apart), 1.0
+        full = white(base, full_scales(base.dtype))
+        return judged(scales, opacities, np.zeros((0, 3)), logs=True, apart=apart), full
 
     def _decode(self, block: Values, raw: Raw) -> None:
         raw.means[:] = self._means(block)

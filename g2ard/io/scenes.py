@@ -51,7 +51,7 @@ def read_back(path: str | Path, splats: Splats) -> Splats:
     read = read_splats(path)
     if scene_format(path).module != "splat":
         return read
-    from g2ard.io import splat
+    import g2ard.io.splat as splat
 
     return splat.read_back(Path(path), splats, read)
 
@@ -198,7 +198,7 @@ def read_cloud(path: str | Path, *, bare: bool = False) -> Cloud:
 
 def write_points(path: str | Path, points: Points, *, overwrite: bool = False) -> None:
     """Write a coloured point cloud as .ply (float64 positions, 8-bit colours) atomically."""
-    from g2ard.io import cloud_ply
+    import g2ard.io.cloud_ply as cloud_ply
 
     path = Path(path)
     if path.suffix.lower() != ".ply":

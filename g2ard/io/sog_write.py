@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from g2ard import _core
+import g2ard._core as _core
 from g2ard._core import __version__
 from g2ard.errors import InputError
 from g2ard.io.atomic import atomic_folder, atomic_output

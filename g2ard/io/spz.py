@@ -18,9 +18,9 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+import g2ard.io.packing as packing
 from g2ard.config.choices import Axes
 from g2ard.errors import InputError, damaged, missing, require
-from g2ard.io import packing
 from g2ard.io.atomic import atomic_output
 from g2ard.io.jsonfile import Place as JsonPlace
 from g2ard.io.jsonfile import Vector, checked, parse_json

@@ -11,9 +11,9 @@ from typing import Any, Generic, TypeVar
 
 import numpy as np
 
+import g2ard.io.judge as judge
 from g2ard.config.choices import Axes, RenderModel
 from g2ard.errors import InputError
-from g2ard.io import judge
 from g2ard.io.paths import file_identity
 from g2ard.io.sanitize import BLOCK, Raw, Tally
 from g2ard.io.types import Cloud, Float, Float32, Mask, Note, Notes, Points, Values

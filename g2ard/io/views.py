@@ -175,8 +175,10 @@ def write_views(
     >>> g2ard.save_views(folder / "views.json", views, splits=["train"])
     >>> g2ard.save_views(folder / "transforms.json", views, splits=["train"])  # for nerfstudio
     """
-    from g2ard.io import colmap, inria, transforms
-    from g2ard.io import g2ard_views as views
+    import g2ard.io.colmap as colmap
+    import g2ard.io.g2ard_views as views
+    import g2ard.io.inria as inria
+    import g2ard.io.transforms as transforms
     from g2ard.scene.cameras import Cameras
 
     check_type("cameras", cameras, Cameras)

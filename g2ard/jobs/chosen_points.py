@@ -11,10 +11,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+import g2ard.io.judge as judge
 from g2ard.config.choices import PointColor
 from g2ard.config.schema import Settings
 from g2ard.errors import InputError, require
-from g2ard.io import Source, judge
+from g2ard.io import Source
 from g2ard.io.sanitize import Tally
 from g2ard.io.stream import JoinedClouds, MarkedPoints, PointStream
 from g2ard.io.types import Float32, Note, Notes, Points

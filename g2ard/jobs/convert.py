@@ -10,11 +10,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+import g2ard.io.spz as spz
 from g2ard.config.checks import Degree, Positive, checks_arguments
 from g2ard.config.choices import AxesName, PointColor, RenderModel
 from g2ard.config.schema import Settings
 from g2ard.errors import InputError, require
-from g2ard.io import Source, spz
+from g2ard.io import Source
 from g2ard.io.scene_formats import FORMATS
 from g2ard.jobs.chosen_points import PointChoice
 from g2ard.jobs.inputs import lifted_cloud, load_scene

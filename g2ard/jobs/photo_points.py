@@ -275,7 +275,7 @@ def placed_source(scene: Source, train: Cameras) -> Source:
     """Return points without those that the file says fewer than two training views see."""
     if scene.format != "points3d":
         return scene
-    from g2ard.io import points3d
+    import g2ard.io.points3d as points3d
 
     placed, chosen = Source(scene.path), scene.through
 
@@ -315,7 +315,9 @@ def sparse_points(file: Path | None, say: Say = unsaid, train: Cameras | None = 
 def sparse_file(views: Views) -> Path | None:
     """Return the file of points of a COLMAP model, of a gsplat run's, of a transforms.json's `ply_file_path`,
     or the input.ply beside INRIA's cameras.json, which may not exist; None for other views."""
-    from g2ard.io import colmap, gsplat_run, transforms
+    import g2ard.io.colmap as colmap
+    import g2ard.io.gsplat_run as gsplat_run
+    import g2ard.io.transforms as transforms
 
     given = views.path if isinstance(views, ViewFiles) else views
     if not isinstance(given, str | Path):

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from g2ard import _core
+import g2ard._core as _core
 from g2ard.errors import InputError
 from g2ard.poses.votes import Votes
 from g2ard.scene.reproducible import Floats, canonical_order, middle, norms, quantile, turned

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from g2ard import _core
+import g2ard._core as _core
 from g2ard.config.choices import BLACK
 from g2ard.errors import require
 from g2ard.poses.site import Inside, Site

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from g2ard import _core
+import g2ard._core as _core
 from g2ard.config.choices import BLACK
 from g2ard.errors import require
 from g2ard.rendering.renderer import RasterSettings, Rendered, Renderer, corners_of, view_of

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from g2ard import _core
+import g2ard._core as _core
 from g2ard.errors import InputError, require_torch
 
 _Image = NDArray[np.floating[Any]]

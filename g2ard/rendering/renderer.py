@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from g2ard import _core
+import g2ard._core as _core
 from g2ard.config.checks import AboveZero, Within, checks_arguments
 from g2ard.config.choices import BLACK, Convention
 from g2ard.config.schema import Settings

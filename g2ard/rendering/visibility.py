@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from g2ard import _core
+import g2ard._core as _core
 from g2ard.progress import Progress, counter, silent
 from g2ard.rendering.renderer import RasterSettings, arrays_of, centred, settings_for, view_of
 from g2ard.scene.cameras import USUAL, Cameras, rows_by_kind

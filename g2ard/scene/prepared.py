@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from g2ard import _core
+import g2ard._core as _core
 from g2ard.errors import InputError
 from g2ard.scene.splats import Splats, unit_quats
 from g2ard.system.cached import cached_property

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from g2ard import _core
+import g2ard._core as _core
 from g2ard.errors import InputError, require
 from g2ard.progress import Progress, counter, silent
 from g2ard.rendering.renderer import Renderer

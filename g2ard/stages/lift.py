@@ -11,7 +11,7 @@ from typing import Annotated, Any, cast
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from g2ard import _core
+import g2ard._core as _core
 from g2ard.config.checks import Within, checks_arguments
 from g2ard.config.choices import NAMED_AXES, Axes, AxesName
 from g2ard.config.schema import Settings

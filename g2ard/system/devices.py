@@ -3,7 +3,7 @@
 import os
 from dataclasses import dataclass
 
-from g2ard import _core
+import g2ard._core as _core
 from g2ard.errors import require
 
 

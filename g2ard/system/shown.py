@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from importlib import import_module
+from collections.abc import Callable
+from typing import Any, ClassVar
 
 
 class Shown:
     """Base of classes that a notebook shows with a picture.
 
-    Pictures need renders and views, which layers above make, so that they are looked up when one is shown.
+    Pictures need renders and views of layers above, so that `g2ard/__init__.py` says how they are made.
     """
 
+    _html_of: ClassVar[Callable[[Any], str]]
+
     def _repr_html_(self) -> str:
-        html: str = import_module("g2ard.jobs.notebook").html_of(self)
-        return html
+        return Shown._html_of(self)

@@ -15,7 +15,7 @@ _MOST = 4
 
 def threads_used() -> int:
     """Return the number of threads of `in_threads`."""
-    from g2ard import _core
+    import g2ard._core as _core
 
     return min(_core.num_threads(), _MOST)
 

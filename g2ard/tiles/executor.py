@@ -16,7 +16,7 @@ from multiprocessing import get_context, parent_process
 from pathlib import Path
 from typing import Any
 
-from g2ard import _core
+import g2ard._core as _core
 from g2ard.errors import G2ardError, InputError, missing
 from g2ard.io.atomic import drop_temporaries
 from g2ard.progress import Progress, silent

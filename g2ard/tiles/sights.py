@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from g2ard import _core
+import g2ard._core as _core
 from g2ard.rendering.visibility import LONGEST, MOST_VIEWS, NEAR, usual_and_others, weight_of_others
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.samples import evenly_spaced, weighted_quantile

@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from g2ard import _core
+import g2ard._core as _core
 from g2ard.io.tile_store import TileStore
 from g2ard.rendering.renderer import RasterSettings, view_of
 from g2ard.rendering.visibility import CONVERGED, NEAR, ROUND, SampledVisibility, spread

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+import g2ard._core as _core
 from benchmarks.baselines.nanogs import _SAMPLES, nanogs
-from g2ard import _core
 from g2ard.errors import InputError
 from g2ard.scene.splats import Splats
 from helpers.raster_cases import scene, splats_of

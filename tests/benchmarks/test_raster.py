@@ -4,9 +4,9 @@ from pathlib import Path
 
 import numpy as np
 
+import g2ard._core as _core
 from benchmarks.kinds.raster import built_in_view, copied_behind, drawn
 from benchmarks.study import SceneSpec
-from g2ard import _core
 from g2ard.io import write_splats
 from g2ard.rendering.renderer import render
 from g2ard.scene.splats import Splats

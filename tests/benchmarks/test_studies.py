@@ -15,8 +15,8 @@ import pytest
 from benchmarks.kinds.methods import METHODS
 from benchmarks.report import write_report
 from benchmarks.rows import read_rows, rounded, shown
-from benchmarks.runner import Cell, run
-from benchmarks.study import DEFINITIONS, SceneSpec, Study, read_study
+from benchmarks.runner import run
+from benchmarks.study import DEFINITIONS, Cell, SceneSpec, Study, read_study
 from g2ard import io
 from g2ard.errors import InputError
 from helpers.commands import CommandLine, refused, succeeds

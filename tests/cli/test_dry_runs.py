@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from g2ard import _core
+import g2ard._core as _core
 from g2ard.cli import app
 from helpers.calls import CALLS, ON, options_of
 from helpers.commands import CommandLine, succeeds

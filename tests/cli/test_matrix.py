@@ -15,7 +15,7 @@ from typing import Any
 
 import pytest
 
-from g2ard import _core
+import g2ard._core as _core
 from g2ard.cli.app import COMMANDS
 from g2ard.cli.console import Console
 from g2ard.io import detect

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from g2ard import _core
+import g2ard._core as _core
 from g2ard.config.choices import METHODS
 from g2ard.rendering.renderer import RasterSettings, Renderer, arrays_of, view_of
 from g2ard.rendering.visibility import visibility, visibility_source

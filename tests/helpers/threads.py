@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from typing import TypeVar
 
-from g2ard import _core
+import g2ard._core as _core
 
 T = TypeVar("T")
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from g2ard import _core
+import g2ard._core as _core
 from g2ard.errors import InputError, OutputError
 from g2ard.io import check_scene_output, read_splats, write_splats
 from g2ard.io.glb import EXTENSION, SPZ_EXTENSION

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from g2ard import _core
+import g2ard._core as _core
 from g2ard.poses import plan_pool
 from g2ard.poses.matter import Grid, Matter
 from g2ard.poses.sight import Glance

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from g2ard import _core
+import g2ard._core as _core
 from g2ard.io import read_cloud, read_splats
 from g2ard.poses import best_views, plan_pool, turntable
 from g2ard.rendering.renderer import arrays_of, settings_for, view_of

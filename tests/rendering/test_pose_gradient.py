@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from g2ard import _core
+import g2ard._core as _core
 from g2ard.errors import InputError
 from g2ard.rendering.renderer import arrays_of, view_of
 from helpers.raster_cases import VARIANTS, camera, oracle, scene, splats_of

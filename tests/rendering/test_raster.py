@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from g2ard import _core
+import g2ard._core as _core
 from g2ard.errors import InputError
 from g2ard.rendering.renderer import RasterSettings, arrays_of, render, settings_for, view_of
 from g2ard.rendering.visibility import visibility, visibility_source

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from g2ard import _core
+import g2ard._core as _core
 from g2ard.config.choices import BLACK
 from g2ard.errors import InputError
 from g2ard.rendering.metrics import detail, edge_psnr, lost_detail, psnr, ssim

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from g2ard import _core
+import g2ard._core as _core
 from g2ard.rendering.renderer import RasterSettings, Renderer, arrays_of, view_of
 from g2ard.rendering.targets import Photos, Targets, TeacherRenders
 from g2ard.scene.prepared import finite_rows_of

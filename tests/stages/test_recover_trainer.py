@@ -9,7 +9,7 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from g2ard import _core
+import g2ard._core as _core
 from g2ard.errors import InputError
 from g2ard.rendering.renderer import RasterSettings, view_of
 from g2ard.scene.cameras import Cameras

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from g2ard import _core
+import g2ard._core as _core
 from g2ard.rendering.renderer import Renderer
 from g2ard.stages.register.align import Aligned, Shot, align, level_of, normal_equations, shot_of
 from g2ard.stages.register.attempts import Search

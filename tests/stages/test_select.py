@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+import g2ard._core as _core
 from benchmarks.synth import city
-from g2ard import _core
 from g2ard.config.choices import POLICIES
 from g2ard.errors import InputError
 from g2ard.io import read_splats

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from g2ard import _core
+import g2ard._core as _core
 from g2ard.errors import InputError
 from g2ard.rendering.renderer import render
 from g2ard.rendering.visibility import visibility_source

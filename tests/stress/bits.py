@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from g2ard import _core
+import g2ard._core as _core
 from g2ard.rendering.renderer import view_of
 from g2ard.stages.recover.config import Rates
 from g2ard.stages.recover.engine import Photometric

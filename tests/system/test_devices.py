@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from g2ard import _core
+import g2ard._core as _core
 from g2ard.cli.run import Run
 from g2ard.io import read_splats, write_splats, write_views
 from g2ard.poses import make_pool

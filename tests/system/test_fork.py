@@ -30,7 +30,7 @@ def in_child(work, *wanted):
     if status:
         sys.exit(f"the child ended with {status}")
 
-from g2ard import _core
+import g2ard._core as _core
 """
 
 _CASES = {

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from g2ard import _core
+import g2ard._core as _core
 from g2ard.errors import InputError
 from g2ard.io import read_splats, write_splats
 from g2ard.io.tile_store import TileStore

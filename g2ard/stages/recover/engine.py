@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from g2ard import _core
+import g2ard._core as _core
 from g2ard.rendering.renderer import RasterSettings, arrays_of, view_of
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.samples import evenly_spaced

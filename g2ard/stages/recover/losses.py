@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from g2ard import _core
+import g2ard._core as _core
 from g2ard.errors import require
 from g2ard.scene.cameras import Cameras
 from g2ard.stages.recover.anchors import Anchors, Regularizers

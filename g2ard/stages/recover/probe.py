@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from g2ard import _core
+import g2ard._core as _core
 from g2ard.rendering.exposure import rendered
 from g2ard.rendering.metrics import psnr
 from g2ard.rendering.renderer import Renderer, arrays_of, centred, settings_for, view_of

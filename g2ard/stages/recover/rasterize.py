@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from g2ard import _core
+import g2ard._core as _core
 from g2ard.config.choices import BLACK
 from g2ard.errors import InputError, require
 from g2ard.rendering.renderer import RasterSettings, View, view_of

@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from g2ard import _core
+import g2ard._core as _core
 from g2ard.scene.splats import Splats
 from g2ard.stages.recover.config import Rates
 from g2ard.stages.recover.engine import LEAST_LOSS, TYPICAL_LOSS, Objective, radii

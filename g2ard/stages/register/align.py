@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from g2ard import _core
+import g2ard._core as _core
 from g2ard.rendering.renderer import Rendered, Renderer
 from g2ard.scene.cameras import Camera
 from g2ard.stages.register.config import RegisterConfig

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from g2ard import _core
+import g2ard._core as _core
 from g2ard.stages.register.pose import Float
 
 _LUMA = np.array([0.299, 0.587, 0.114])

@@ -8,13 +8,13 @@ from typing import Literal
 
 import numpy as np
 
+import g2ard.stages.select.poses as poses
 from g2ard.config.checks import checks_arguments
 from g2ard.config.choices import POLICIES
 from g2ard.errors import InputError, require
 from g2ard.progress import Progress, plural, silent
 from g2ard.scene.cameras import Cameras, unseeing
 from g2ard.scene.splats import Splats
-from g2ard.stages.select import poses
 from g2ard.stages.select.surfaces import CoverageOptions, Float, Order, greedy
 
 _LEAST_CURVE_BEND = 0.02

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from g2ard import _core
+import g2ard._core as _core
 from g2ard.errors import InputError
 from g2ard.progress import Progress, counter, silent
 from g2ard.scene.cameras import Cameras, unseeing

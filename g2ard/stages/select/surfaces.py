@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from g2ard import _core
+import g2ard._core as _core
 from g2ard.config.checks import AtLeastOne, NotNegative, Positive, Within
 from g2ard.config.schema import Settings
 from g2ard.errors import InputError, require

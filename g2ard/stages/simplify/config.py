@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
 
-from g2ard import _core
+import g2ard._core as _core
 from g2ard.config.checks import AtLeastOne, Positive, Share, Within
 from g2ard.config.choices import Method
 from g2ard.config.schema import Settings
