@@ -26,7 +26,9 @@ class _Line:
     """The line that `show_progress` redraws, and when its stage began."""
 
     def __init__(self) -> None:
-        self.stage, self.began, self.drawn = "", 0.0, 0.0
+        self.stage = ""
+        self.began = 0.0
+        self.drawn = 0.0
         self.cell: tuple[int, Any] | None = None  # of a notebook: number, and handle of the line in it
 
     def show(self, text: str, shell: Any) -> None:
@@ -60,12 +62,16 @@ def show_progress(stage: str, done: int, total: int, info: Mapping[str, Any] | N
     >>> import g2ard
     >>> small = g2ard.distill("scene.ply", ratio=10, progress=g2ard.show_progress)  # doctest: +SKIP
     """
-    now, ended, shell = time.monotonic(), 0 < total <= done, kernel()
+    now = time.monotonic()
+    ended = 0 < total <= done
+    shell = kernel()
     if shell is None and sys.stderr is None:  # a program without a console
         return
     terminal = getattr(sys.stderr, "isatty", bool)()
     if stage != _line.stage:
-        _line.stage, _line.began, _line.drawn = stage, now, 0.0
+        _line.stage = stage
+        _line.began = now
+        _line.drawn = 0.0
     if ended and shell is None:
         print(f"\r{'':{_WIDTH}}\r", end="", file=sys.stderr, flush=True)
     elif ended or now - _line.drawn >= (0.1 if terminal else 1):

@@ -45,7 +45,8 @@ class Count:
         if match is None or not float(match[1]) > 0 or (match[2] == "%" and not shares):
             such = "250000, 250k, 1.5M or 25%" if shares else "250000, 250k or 1.5M"
             raise typer.BadParameter(f"expected a positive count such as {such}, got {text!r}")
-        number, unit = float(match[1]), match[2].lower()
+        number = float(match[1])
+        unit = match[2].lower()
         if unit == "%":
             if number > 100:
                 raise typer.BadParameter(f"expected at most 100%, got {text!r}")

@@ -29,7 +29,8 @@ def load_config(ctx: typer.Context, path: Path | None) -> Path | None:
     """
     if path is None:
         return None
-    values, name = _read(path), str(ctx.info_name)
+    values = _read(path)
+    name = str(ctx.info_name)
     tables = {key: value for key, value in values.items() if isinstance(value, dict) and key != "set"}
     top = {key: value for key, value in values.items() if key not in tables}
     commands = _parameters(ctx, path, tables)
@@ -88,7 +89,8 @@ def _parameters(ctx: typer.Context, path: Path, tables: Iterable[str]) -> dict[s
 
 def _check_keys(table: dict[str, Any], known: dict[str, Any], problem: str) -> None:
     """Reject unknown keys, with similar names, and letters of options that have a longer name."""
-    told, long = [], [flag for flag in known if len(flag) > 1]
+    told = []
+    long = [flag for flag in known if len(flag) > 1]
     for key in sorted(table):
         name = key if len(key) > 1 or key not in known else _long_name(known[key])
         if name != key:
@@ -142,7 +144,8 @@ def printed(ctx: typer.Context, values: dict[str, Any]) -> str:
     lines = [f"[{ctx.info_name}]"]
     constants: list[str] = []
     for parameter in ctx.command.params:
-        name, value = str(parameter.name), values.get(str(parameter.name))
+        name = str(parameter.name)
+        value = values.get(str(parameter.name))
         if name in _NOT_KEPT or value in (None, [], ()):
             continue
         if name == "set":

@@ -101,7 +101,8 @@ class _Stage:
 
     def note(self, now: float) -> None:
         """Compare the estimated duration with that at half of the time so far; alike, they are settled."""
-        elapsed, share = now - self.began, self.share
+        elapsed = now - self.began
+        share = self.share
         if share <= 0 or elapsed < 1 or (self.noted is not None and elapsed < 2 * self.noted[0]):
             return
         whole = elapsed / share
@@ -116,7 +117,8 @@ class _Stage:
 
     def left(self, now: float) -> float | None:
         """Return the estimated seconds to the end, or None if they are unknown, or not yet settled."""
-        elapsed, share = now - self.began, self.share
+        elapsed = now - self.began
+        share = self.share
         return elapsed / share * (1 - share) if self.settled and share > 0 else None
 
 
@@ -131,7 +133,8 @@ class _Plan:
     """
 
     def __init__(self, stages: Sequence[tuple[str, float]], now: float) -> None:
-        self._ahead, self._began = list(stages), now
+        self._ahead = list(stages)
+        self._began = now
         self._current = ("", 0.0)
         self._done = 0.0
 
@@ -141,7 +144,8 @@ class _Plan:
         if stage in names:
             row = names.index(stage)
             self._done += self._current[1]
-            self._current, self._ahead = self._ahead[row], self._ahead[row + 1 :]
+            self._current = self._ahead[row]
+            self._ahead = self._ahead[row + 1 :]
 
     def left(self, stage: str, now: float, share: float, left: float) -> float | None:
         """Return the seconds that the command still needs, if known."""
@@ -250,13 +254,15 @@ class Console:
         if self.quiet:
             return
         with self._lock:
-            now, current = time.monotonic(), self._stage
+            now = time.monotonic()
+            current = self._stage
             if current is None or current.name != stage or done < current.done or current.ended:
                 self._end_stage()
                 current = self._stage = _Stage(stage, now, done if done < total else 0, printed=now)
                 if self._plan is not None:
                     self._plan.reach(stage)
-            current.done, current.total = done, total
+            current.done = done
+            current.total = total
             current.note(now)
             current.figures = [f"{name} {value}" for name, value in (info or {}).items()]
             if total and done >= total:
@@ -288,7 +294,8 @@ class Console:
         if self._drawn:
             self._draw()
             return
-        stage, now = self._stage, time.monotonic()
+        stage = self._stage
+        now = time.monotonic()
         if stage is not None and stage.ended is None and now - stage.printed >= _PLAIN_PERIOD:
             stage.printed = now
             self._print(stage, now)
@@ -330,7 +337,8 @@ class Console:
         from rich.table import Table
         from rich.text import Text
 
-        stage, now = self._stage, time.monotonic()
+        stage = self._stage
+        now = time.monotonic()
         if stage is None or (stage.ended is not None and now - stage.ended > _SILENT_SECONDS):
             stage = _Stage(f"{self._name}: working", self._began)
         total = f"{stage.total:,}"

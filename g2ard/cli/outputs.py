@@ -69,7 +69,10 @@ class Outputs:
         *,
         name: str = "--output",
     ) -> None:
-        self._pattern, self._budgets, self._check, self._name = str(pattern), budgets, check, name
+        self._pattern = str(pattern)
+        self._budgets = budgets
+        self._check = check
+        self._name = name
         self._checked: set[Path] = set()
         words = set(re.findall(r"{[a-z_]*}", pattern.name))  # braces elsewhere, as of a GUID, mean themselves
         if strange := words - {"{ratio}", "{count}"}:

@@ -120,7 +120,9 @@ class Command(TyperCommand):
 
     def format_help(self, ctx: Any, formatter: Any) -> None:
         """Print the help with the used options or all of them."""
-        params, epilog, used = self.params, self.epilog, USED.get(str(self.name), ())
+        params = self.params
+        epilog = self.epilog
+        used = USED.get(str(self.name), ())
         rest = [p for p in params if p.param_type_name == "option" and p.name not in used]
         if not self._all and rest:
             self.params = [p for p in params if p not in rest]
@@ -128,4 +130,5 @@ class Command(TyperCommand):
         try:
             super().format_help(ctx, formatter)
         finally:
-            self.params, self.epilog = params, epilog
+            self.params = params
+            self.epilog = epilog

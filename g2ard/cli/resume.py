@@ -53,7 +53,8 @@ def check_same(run: Run, record: Mapping[str, Any], output: Path, *others: str) 
     Args:
         others: further names of differing options.
     """
-    then, now = record.get("config", {}), json.loads(json.dumps(run.config, default=str))
+    then = record.get("config", {})
+    now = json.loads(json.dumps(run.config, default=str))
     names = [name for name in now if name in then and name not in CALL_OPTIONS]
     found = [*others, *(name.replace("_", "-") for name in names if now[name] != then[name])]
     if found:
@@ -62,7 +63,8 @@ def check_same(run: Run, record: Mapping[str, Any], output: Path, *others: str) 
             path=output,
             hint="-w without --resume starts over",
         )
-    known, present = record.get("inputs", {}), identities(run.input_files())
+    known = record.get("inputs", {})
+    present = identities(run.input_files())
     missing = [path for path in run.named_inputs() if not path.exists()]  # without them, nothing is read anew
     gone = [Path(name) for name in known if name not in present and not Path(name).is_file()]
     lost = [str(path) for path in gone if not {real_path(path), *real_path(path).parents} & set(missing)]

@@ -136,7 +136,8 @@ class Run(Claims):
             yield
         except Exception as error:
             if self._unshown is None:
-                self._failed, self._unshown = what, error
+                self._failed = what
+                self._unshown = error
 
     def end(self) -> None:
         """Raise the error of the first page or picture that failed."""

@@ -72,11 +72,15 @@ class RunFolder:
     """
 
     def __init__(self, run: Run, path: Path, name: str, resume: bool) -> None:
-        self._run, self._resume = run, resume
-        self.path, self.scene, self.unfinished = path, path / name, path / _WORK_FOLDER
+        self._run = run
+        self._resume = resume
+        self.path = path
+        self.scene = path / name
+        self.unfinished = path / _WORK_FOLDER
         self._report = path / "report.json"  # written last
         self._simplified = path / "simplified" / "scene.ply"  # with --keep, for `evaluate --anchors`
-        self._view, self._views = path / "view.html", path / "views.json"
+        self._view = path / "view.html"
+        self._views = path / "views.json"
         self._scored = path / "scored.json"  # if some scored views are not in views.json
         self._inputs: dict[str, Any] = {}  # identity of each file that this run reads
 
@@ -112,7 +116,8 @@ class RunFolder:
 
     def _lacking(self, record: Mapping[str, Any]) -> list[str]:
         """Return the options of this command whose files a finished run lacks."""
-        then, now = record.get("config", {}), self._run.config
+        then = record.get("config", {})
+        now = self._run.config
         asked = {
             "--keep": now["keep"] and not self._simplified.exists(),
             "--page": now["page"] and not then.get("page", True),
@@ -199,8 +204,11 @@ class RunFolder:
         title = f"{names_of([Path(str(source))])[0]}: {report.title}"
         scenes = [] if report.photos else [("simplified", done.simplified)]  # a start of photos is a blur
         scenes.append((RESULT, done.splats))
-        recover, page = job.config.recover, self.path / "report.html"
-        renderers, best, shown = renderers_of(scenes, recover.background), drawn.best, []
+        recover = job.config.recover
+        page = self.path / "report.html"
+        renderers = renderers_of(scenes, recover.background)
+        best = drawn.best
+        shown = []
         with self._run.showing(_PICTURE):
             fill(best, self._run.progress)
             on_white = None
@@ -211,7 +219,8 @@ class RunFolder:
             preview(self.path / _PICTURE, shown, scenes)
         line = ""
         if self._run.config["page"]:
-            dense, config = None, self._run.config
+            dense = None
+            config = self._run.config
             of_points = isinstance(source, Source) and source.kind == "points"
             alone = not config["compare"] or str(config["fit"]).startswith("page:")
             if not alone and isinstance(source, Source) and not recover.from_points and job.plan is None:
@@ -251,15 +260,19 @@ class RunFolder:
                 page large.
             of_points: whether that scene is a point cloud.
         """
-        count, most = len(splats), DEVICES["web"]
+        count = len(splats)
+        most = DEVICES["web"]
         if count > most:
             return None, f"{self._view} skipped: over {most:,} Gaussians (`g2ard view` writes it anyway)"
         stand = frame_with(splats, cameras)
         behind = self._backdrop(background, splats if dense is None else dense[1], of_points)
         shown: list[Source | str] = [names_of([self.path])[0]]
-        scenes, roles = [splats], [RESULT]
+        scenes = [splats]
+        roles = [RESULT]
         if dense is not None and count < len(dense[1]) <= LARGEST_DENSE:
-            shown, scenes, roles = [dense[0], *shown], [dense[1], splats], [DENSE, RESULT]
+            shown = [dense[0], *shown]
+            scenes = [dense[1], splats]
+            roles = [DENSE, RESULT]
         labels = labels_of(shown, [len(scene) for scene in scenes], roles)
         turned = [(label, stand.of(scene)) for label, scene in zip(labels, scenes, strict=True)]
         written, _ = write_page(self._view, turned, start=stand.start, background=behind, overwrite=True)

@@ -106,7 +106,8 @@ def told(report: RunReport, *, verbose: bool = False) -> list[str]:
         lines.append(f"{report.unseen:.0%} of the scene is in no view: simplified but not recovered")
     lines += report.warnings or ()
     if report.packed:
-        size, unpacked = report.bytes["file"] or 0, report.scores["recovered"].psnr
+        size = report.bytes["file"] or 0
+        unpacked = report.scores["recovered"].psnr
         lines += score_lines(report.packed, size, unpacked, report.size)
     return [line for line in lines if line is not None]
 

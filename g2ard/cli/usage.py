@@ -51,7 +51,8 @@ def meant(words: Iterable[str], known: Iterable[str]) -> str:
     """
     from difflib import get_close_matches
 
-    there, told = sorted(known), []
+    there = sorted(known)
+    told = []
     for word in sorted(words):
         near = get_close_matches(word, there, 2)
         told.append(f"{word} (did you mean {' or '.join(near)}?)" if near else word)
@@ -119,7 +120,8 @@ def _allowed(parameter: Any) -> str:
     if descriptor.choices is not None:
         return described(Literal[tuple(descriptor.choices)])
     kinds = {bool: "true or false", int: "a whole number", float: "a number"}
-    low, high = descriptor.parameter_info.min, descriptor.parameter_info.max
+    low = descriptor.parameter_info.min
+    high = descriptor.parameter_info.max
     bounds = {
         (True, True): f" from {low} to {high}",
         (True, False): f" of at least {low}",

@@ -42,7 +42,8 @@ def tiling_of(run: Run, source: Source | None, output: Path) -> Tiling:
         raise typer.BadParameter(f"--scheduler: expected tcp://HOST:PORT or local, got {scheduler!r}")
     folder = work or _beside(output)
     run.claim("--work", folder, folder=True)
-    cores, renew = run.threads or None, work is None or run.overwrite
+    cores = run.threads or None
+    renew = work is None or run.overwrite
     return Tiling(rows, size, workers, cores, scheduler, folder, keep=work is not None, overwrite=renew)
 
 
@@ -65,10 +66,8 @@ def _check_rows(source: Source, rows: int) -> None:
     from g2ard.jobs.tile_options import cut_into
 
     if source.store is not None and (made := source.store.settings.get("tile_rows")) != rows:
-        held, other = (
-            f"already has tiles of {made:,}" if made else "already has tiles",
-            cut_into(source.path, rows),
-        )
+        held = f"already has tiles of {made:,}" if made else "already has tiles"
+        other = cut_into(source.path, rows)
         raise typer.BadParameter(f"--tile-rows: {source} {held}; to change them, run {other}")
 
 

@@ -257,7 +257,8 @@ def _hints(owner: Any) -> dict[str, Any]:
 def _fits(value: Any, kind: Any) -> bool:
     if kind is _Array or kind is Any:
         return kind is Any or _is_array(value)
-    origin, inner = get_origin(kind), get_args(kind)
+    origin = get_origin(kind)
+    inner = get_args(kind)
     if origin in _UNIONS:
         return any(_fits(value, option) for option in inner)
     if origin is Annotated:

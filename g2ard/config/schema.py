@@ -41,11 +41,13 @@ class Settings:
 
     def __init_subclass__(cls, tag: str | None = None, variants: Sequence[str] = ()) -> None:
         if tag is not None:
-            cls._tag, cls._variants = tag, {}
+            cls._tag = tag
+            cls._variants = {}
         cls._variants.update(dict.fromkeys(variants, cls))
 
     def __new__(cls, *first: Any, **values: Any) -> Self:
-        kind, name = cls, None
+        kind = cls
+        name = None
         if cls._tag is not None and cls not in cls._variants.values():
             given = dict(zip(_names(cls), first, strict=False)) | values
             name = given.get(cls._tag, next(iter(cls._variants)))
@@ -79,7 +81,8 @@ class Settings:
         tag = str(self._tag)
         if name in (None, getattr(self, tag)):
             return self
-        kind, usual = self._variant(name), type(self)(**{tag: getattr(self, tag)})
+        kind = self._variant(name)
+        usual = type(self)(**{tag: getattr(self, tag)})
         changed = {field: value for field, value in vars(self).items() if value != getattr(usual, field)}
         kept = {field: value for field, value in changed.items() if field in _names(kind)}
         return kind(**{**kept, tag: name})
@@ -198,7 +201,8 @@ def _leaves(config: Any, root: str | None = None, every: bool = False) -> Iterat
     owner: Any = type(config)
     kinds = _kinds(owner)
     for f in fields(config):
-        path, value = _joined(root, f.name), getattr(config, f.name)
+        path = _joined(root, f.name)
+        value = getattr(config, f.name)
         if is_dataclass(value):
             if hasattr(value, "named"):
                 yield _Leaf(path, str, value)
@@ -243,7 +247,8 @@ def _changed(config: Any, root: str, values: Mapping[str, Any]) -> Any:
         except InputError as error:
             raise error.at(parameter=_joined(root, str(error.parameter))) from None
     for f in fields(config):
-        path, held = _joined(root, f.name), getattr(config, f.name)
+        path = _joined(root, f.name)
+        held = getattr(config, f.name)
         if is_dataclass(held) and not isinstance(held, type):
             inner = _changed(_whole(held, values.get(path, held), path), path, values)
             if inner != held:
@@ -305,7 +310,8 @@ def _as(kind: Any, text: str) -> Any:
     if get_origin(kind) is Literal and text in get_args(kind):
         return text
     if get_origin(kind) is tuple:
-        kinds, text = get_args(kind), text.strip("()[]")
+        kinds = get_args(kind)
+        text = text.strip("()[]")
         if kinds[-1] is Ellipsis:
             mark = ";" if get_origin(kinds[0]) is tuple else ","
             return tuple(_as(kinds[0], part.strip()) for part in text.split(mark) if part.strip())

@@ -85,7 +85,8 @@ def save_levels(
     >>> (folder / "lod-meta.json").is_file()
     True
     """
-    rule, path = cut or Cut(), Path(path)
+    rule = cut or Cut()
+    path = Path(path)
     levels, error, moved = aligned(levels)
     if environment is not None:
         environment = environment.narrowed(levels[0].offset)
@@ -171,7 +172,8 @@ class _Files:
         """Append a leaf's rows and return their file, offset and count."""
         name, filled = self.last.get(level, ("", self.most + 1))
         if filled > self.most:
-            name, filled = f"{level}_{sum(of == level for of in self.level_of.values())}/meta.json", 0
+            name = f"{level}_{sum(of == level for of in self.level_of.values())}/meta.json"
+            filled = 0
             self.parts[name], self.level_of[name] = [], level
         self.parts[name].append(rows)
         self.last[level] = name, filled + len(rows)

@@ -146,7 +146,8 @@ def save_tileset(
 ) -> tuple[int, list[Note]]:
     """Write `tileset.json` and `LEVEL_N.glb`; see `g2ard.jobs.levels.save_tileset`, with `up` and `place`
     decided. Return bytes and notes."""
-    path, rule = Path(path), cut or Cut()
+    path = Path(path)
+    rule = cut or Cut()
     levels, error, moved = aligned(levels)
     tree = cut_tree(levels, rule, work)
     tiles = _Tiles(levels, rule.most, path, Rounding(moved), error)
@@ -251,7 +252,8 @@ def _tile(node: Node, error: float, children: list[dict[str, Any]]) -> dict[str,
 
 def _named_in(file: Path) -> set[Path]:
     """Return the names of the .glb files beside a tileset.json that it names."""
-    tiles, names = [read_object(file).get("root", {})], set()
+    tiles = [read_object(file).get("root", {})]
+    names = set()
     while tiles:
         tile = tiles.pop()
         names.add(str(tile.get("content", {}).get("uri", "")))

@@ -72,7 +72,9 @@ def aligned(levels: Sequence[Level]) -> tuple[list[Level], float, bool]:
     check_levels(levels)
     first = levels[0]
     offset = first.narrowed().offset if isinstance(first, Splats) else first.offset
-    moved, found, error = bool((offset != first.offset).any()), [], 0.0
+    moved = bool((offset != first.offset).any())
+    found = []
+    error = 0.0
     for level in levels:
         near = level
         if isinstance(level, Splats) and (moved or level.means.dtype == np.float64):
@@ -131,10 +133,14 @@ class _Tree:
     """Rows of all levels, numbered consecutively; the rows of a node are in ascending order."""
 
     def __init__(self, levels: Sequence[Level], rule: Cut, scratch: Path | None) -> None:
-        self.levels, self.rule, self.scratch = levels, rule, scratch
+        self.levels = levels
+        self.rule = rule
+        self.scratch = scratch
         self.starts = np.cumsum([0, *map(len, levels)])
-        count, at = int(self.starts[-1]), 0
-        self.kept, self.filled = self.room(count), 0
+        count = int(self.starts[-1])
+        at = 0
+        self.kept = self.room(count)
+        self.filled = 0
         wide = any(isinstance(level, Splats) and level.means.dtype == np.float64 for level in levels)
         self.means = self.room((count, 3), np.float64 if wide else np.float32)
         for number, level in enumerate(levels):
@@ -160,7 +166,8 @@ class _Tree:
             return self._leaf(rows)
         axis = int(sides.argmax())
         below, above = self._halves(rows, axis, axes)
-        one, other = self.of(below, (*axes, axis)), self.of(above, (*axes, axis))
+        one = self.of(below, (*axes, axis))
+        other = self.of(above, (*axes, axis))
         return Node(np.minimum(one.low, other.low), np.maximum(one.high, other.high), (one, other))
 
     def _box(self, rows: Rows) -> tuple[Float, Float]:
@@ -187,11 +194,14 @@ class _Tree:
         if axes:
             tied = tied[np.lexsort([self.means[tied, a] for a in axes])]
         lower = np.sort(tied[:short])
-        below, above, done = self.room(middle), self.room(len(rows) - middle), 0
+        below = self.room(middle)
+        above = self.room(len(rows) - middle)
+        done = 0
         for at in _blocks(len(rows)):
             part = rows[at]
             inside = (self.means[part, axis] < limit) | np.isin(part, lower, assume_unique=True)
-            some, rest = part[inside], part[~inside]
+            some = part[inside]
+            rest = part[~inside]
             below[done : done + len(some)] = some
             above[at.start - done : at.start - done + len(rest)] = rest
             done += len(some)
@@ -199,8 +209,10 @@ class _Tree:
 
     def _leaf(self, rows: Rows) -> Node:
         """Build the leaf of these rows: its rows per level, and the box of their Gaussians' 1σ extents."""
-        ends, parts = np.searchsorted(rows, self.starts), []
-        low, high = np.full(3, np.inf), np.full(3, -np.inf)
+        ends = np.searchsorted(rows, self.starts)
+        parts = []
+        low = np.full(3, np.inf)
+        high = np.full(3, -np.inf)
         for level, start, a, b in zip(self.levels, self.starts, ends, ends[1:], strict=False):
             part = self.kept[self.filled : self.filled + b - a]
             part[:] = rows[a:b] - start
@@ -208,7 +220,8 @@ class _Tree:
             self.filled += b - a
             if a < b:
                 some = level.take(part)
-                means, reach = some.means.astype(np.float64), _reach(some)
+                means = some.means.astype(np.float64)
+                reach = _reach(some)
                 low = np.minimum(low, (means - reach).min(axis=0))
                 high = np.maximum(high, (means + reach).max(axis=0))
         return Node(low, high, rows=tuple(parts))

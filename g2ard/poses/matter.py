@@ -213,23 +213,27 @@ class Grid:
         cell = float(np.cbrt(np.prod(sides) / cells))
         shape = np.maximum(1, np.ceil(sides / cell)).astype(int)
         points = turned(matter.points, axes)
-        filled, logs = np.zeros(int(np.prod(shape))), np.zeros(int(np.prod(shape)))
+        filled = np.zeros(int(np.prod(shape)))
+        logs = np.zeros(int(np.prod(shape)))
         sizes = 0.5 * np.log(np.maximum(matter.scales[:, 1] * matter.scales[:, 2], np.finfo(float).tiny))
         faces = 2 * np.pi * matter.scales[:, 1] * matter.scales[:, 2] / cell**2
         optical = matter.represents * matter.opacities * faces
         parts = np.clip(np.ceil(_HALF_WIDTH * matter.scales[:, 2] / cell), 1, _PARTS).astype(np.int8)
         for count in np.unique(parts).tolist():
-            rows, spans = np.flatnonzero(parts == count), np.zeros((1, 2, 3))
+            rows = np.flatnonzero(parts == count)
+            spans = np.zeros((1, 2, 3))
             if count > 1:
                 spans = matter.axes(rows)[:, 1:] * matter.scales[rows, 1:, None]
                 spans = turned(spans.reshape(-1, 3), axes).reshape(-1, 2, 3)
             offsets = _HALF_WIDTH * ((np.arange(count) + 0.5) / count * 2 - 1)
             for a, b in product(offsets, offsets):
                 index, inside = _index(points[rows] + a * spans[:, 0] + b * spans[:, 1], low, cell, shape)
-                share, size = optical[rows[inside]] / count**2, sizes[rows[inside]]
+                share = optical[rows[inside]] / count**2
+                size = sizes[rows[inside]]
                 np.add.at(filled, index[inside], share)
                 np.add.at(logs, index[inside], share * size)
-        scale, some = np.zeros(len(filled), np.float32), filled > 0
+        scale = np.zeros(len(filled), np.float32)
+        some = filled > 0
         scale[some] = np.exp(logs[some] / filled[some])
         opaque, murky = (_steps((filled > limit).reshape(shape)) for limit in (_OPAQUE, _MURKY))
         return cls(low, cell, opaque, murky, scale.reshape(shape))
@@ -265,7 +269,8 @@ class Grid:
 
 def _index(points: Floats, low: Floats, cell: float, shape: NDArray[Any]) -> tuple[Any, NDArray[np.bool_]]:
     """Return flat cell indices, clamped into the box, and whether each point was in it."""
-    flat, inside = np.zeros(len(points), np.int64), np.ones(len(points), bool)
+    flat = np.zeros(len(points), np.int64)
+    inside = np.ones(len(points), bool)
     for axis in range(3):
         place = np.floor((points[:, axis] - low[axis]) / cell)
         inside &= (place >= 0) & (place < shape[axis])

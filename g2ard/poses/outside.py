@@ -81,7 +81,8 @@ def plan_orbit(survey: Survey, count: int, shift: int = 0, first: int | None = N
     Each is as near as the object fits the frame. Poses below the ground, in matter or close to it are
     dropped. The others see the object, because it fills their frame. `first` is a second limit on the number.
     """
-    site, lens = survey.site, survey.lens
+    site = survey.site
+    lens = survey.lens
     target = site.box.mean(axis=0)
 
     def tried(start: int, stop: int) -> tuple[Poses, Floats]:
@@ -100,7 +101,8 @@ def plan_orbit(survey: Survey, count: int, shift: int = 0, first: int | None = N
 
 def _fitting(site: Site, target: Floats, outward: Floats, lens: Lens) -> Floats:
     """Return (P,) distances at which `_FITTING` of the matter is in frame, and all of it ahead."""
-    points, weights = site.points[:_OUTLINE] - target, site.weights[:_OUTLINE]
+    points = site.points[:_OUTLINE] - target
+    weights = site.weights[:_OUTLINE]
     wide, tall = lens.tangents
     distances = np.empty(len(outward))
     for i, frame in enumerate(Poses(outward, -outward).frames()):
@@ -114,8 +116,10 @@ def ring(survey: Survey, rises: Sequence[float], turns: int) -> Poses:
 
     Poses in matter are dropped.
     """
-    site, body = survey.site, survey.site.body
-    points, (wide, tall) = site.points[:_OUTLINE], np.array(survey.lens.tangents) * _FILLED
+    site = survey.site
+    body = survey.site.body
+    points = site.points[:_OUTLINE]
+    (wide, tall) = np.array(survey.lens.tangents) * _FILLED
     rise, turn = (part.ravel() for part in np.meshgrid(np.radians(rises), np.arange(turns) / turns))
     gazes = -directions(turn, np.cos(rise), np.sin(rise))
     eyes = np.empty_like(gazes)
@@ -141,8 +145,10 @@ def _away(x: Floats, y: Floats, wide: float, tall: float, body: float) -> Floats
 
 def circle(survey: Survey, gazes: Floats) -> Poses:
     """Return poses on a level circle around a scene, with all of it just in frame."""
-    target, body = survey.site.box.mean(axis=0), survey.site.body
-    points, weights = survey.site.points[:_OUTLINE] - target, survey.site.weights[:_OUTLINE]
+    target = survey.site.box.mean(axis=0)
+    body = survey.site.body
+    points = survey.site.points[:_OUTLINE] - target
+    weights = survey.site.weights[:_OUTLINE]
     wide, tall = np.array(survey.lens.tangents) * _FILLED
     frames = Poses(gazes, gazes).frames()
     seen = [turned(points, frames[i]).T for i in evenly_spaced(len(gazes), _FITTED)]
@@ -167,7 +173,8 @@ def plan_aerial(survey: Survey, count: int, shift: int = 0, first: int | None = 
     see much each, many see detail. Poses in matter or close to it are dropped, and poses with at least three
     quarters of the frame covered are preferred. `first` limits the number without changing the height.
     """
-    site, lens = survey.site, survey.lens
+    site = survey.site
+    lens = survey.lens
     height = _height(site, count, lens)
 
     def tried(start: int, stop: int) -> tuple[Poses, Floats]:

@@ -201,11 +201,13 @@ def plan_pool(
     held = _held(survey, poses)
     wanted = round(count * max(1.0, min(grow, 1 / np.sqrt(held))))
     if len(poses) == count and wanted > _WORTH * count:
-        first, before = poses, used
+        first = poses
+        before = used
         poses, used, why = _planned(survey, kind, wanted)
         if set(before) - set(used):  # more poses from above are lower, and may be judged otherwise
             rest = np.linspace(0, len(poses) - 1, wanted - count).round().astype(int)
-            poses, used = Poses.joined([first, poses.take(rest)]), list(dict.fromkeys([*before, *used]))
+            poses = Poses.joined([first, poses.take(rest)])
+            used = list(dict.fromkeys([*before, *used]))
     if len(poses) < count:
         raise InputError(
             f"{len(poses)} of {count} poses found a free place with a view ({kind}: {why}); "
@@ -219,7 +221,8 @@ def plan_pool(
     need = max(float(np.interp(reach[2].mean(), _COARSE, (0, 1))), 1 - held)
     near_poses = plan_near(survey, poses, reach, int(near * need * len(poses)), 1)
     if len(near_poses):
-        poses, used = _replaced(poses, near_poses), [*used, "near"]
+        poses = _replaced(poses, near_poses)
+        used = [*used, "near"]
         reach = reach_of(survey, poses)
     spread = max(float(np.ptp(poses.eyes, axis=0).max()), np.finfo(float).tiny)
     features = np.concatenate([poses.eyes / spread, poses.gazes / 4], axis=1)  # close for similar poses
@@ -258,7 +261,8 @@ def _planned(survey: Survey, kind: str, count: int) -> tuple[Poses, list[str], s
     if kind == "auto":
         parts, why = _auto(survey, count)
     else:
-        parts, why = {kind: _PLANNERS[kind](survey, count)}, "as requested"
+        parts = {kind: _PLANNERS[kind](survey, count)}
+        why = "as requested"
     return Poses.joined([*parts.values()]).take(slice(count)), [*parts], why
 
 
@@ -285,7 +289,8 @@ def _auto(survey: Survey, count: int) -> tuple[dict[str, Poses], str]:
     other poses stand around or above the scene as its shape allows, where it looks sharp from there. The
     remaining poses stand on the ground and wherever the scene looks sharp.
     """
-    inside, landscape = survey.inside, survey.site.is_landscape
+    inside = survey.inside
+    landscape = survey.site.is_landscape
     parts: dict[str, Poses] = {}
     why = [f"{inside.share:.1%} of its box lies within rooms"]
 

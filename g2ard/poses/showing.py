@@ -115,7 +115,8 @@ class Outlook:
     @classmethod
     def of(cls, survey: Survey, cameras: Cameras, full: float = -1.0) -> Outlook:
         """Look through the views, whose covered share to the power of `full` counts."""
-        site, glance = survey.site, survey.outlook
+        site = survey.site
+        glance = survey.outlook
         points = (glance.points - site.origin) @ site.axes.T / site.size
         mass = glance.opacities * ((points > site.box[0]) & (points < site.box[1])).all(axis=1)
         covered, sharp, detail, spread, seen = glance.sights(cameras)
@@ -178,7 +179,8 @@ def _sees_less(around: Outlook, within: Outlook) -> bool:
 
 def _looks(survey: Survey) -> tuple[Outlook, str]:
     """Return views that show a scene "within" it, planned only if it may be shown so, or from "around"."""
-    around, room = _outside(survey), is_room(survey)
+    around = _outside(survey)
+    room = is_room(survey)
     blurred = around.clear.sum() <= _CRISP * len(around.cameras)
     room = room or (not blurred and is_walled(survey))
     if room or blurred or _is_roofed(survey):
@@ -234,8 +236,11 @@ def turntable(
     """
     survey = _survey(splats, size, axis)
     best, kind = _best(survey, 1, cameras and cameras.usual())
-    site, first, angles = survey.site, best[0], 2 * np.pi * np.arange(count) / count
-    eye, gaze = (first.position - site.origin) @ site.axes.T / site.size, best.forwards[0] @ site.axes.T
+    site = survey.site
+    first = best[0]
+    angles = 2 * np.pi * np.arange(count) / count
+    eye = (first.position - site.origin) @ site.axes.T / site.size
+    gaze = best.forwards[0] @ site.axes.T
     away = 0.0
     if kind == "photos":
         assert cameras is not None
@@ -264,7 +269,8 @@ def _within_arc(angles: Floats, seen: Floats) -> Floats:
     widest = int(np.argmax(gaps))
     if gaps[widest] < _GAP:
         return angles
-    low, high = order[widest] + gaps[widest] - 2 * np.pi, order[widest]
+    low = order[widest] + gaps[widest] - 2 * np.pi
+    high = order[widest]
     return np.where(np.sin(angles) > 0, high, -low) * np.sin(angles)
 
 
@@ -305,8 +311,10 @@ def _chosen(look: Outlook, worth: Floats, count: int) -> list[int]:
     clear = look.clear + _LEAST
     worth = np.where(clear >= _CLEAR * clear.max(initial=0), worth * clear, 0.0)
     total = look.seen.sum(axis=1, dtype=np.float64)
-    forwards, least = look.cameras.forwards, np.full(len(total), np.inf)
-    union, chosen = np.zeros_like(look.seen[:1]), list[int]()
+    forwards = look.cameras.forwards
+    least = np.full(len(total), np.inf)
+    union = np.zeros_like(look.seen[:1])
+    chosen = list[int]()
     while len(chosen) < min(count, len(total)):
         new = np.maximum(look.seen - union, 0).sum(axis=1, dtype=np.float64)
         value = worth * (new + _AGAIN * total) * np.minimum(1, least / _APART)

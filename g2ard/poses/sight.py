@@ -109,7 +109,8 @@ class Poses:
     def joined(cls, parts: list[Poses]) -> Poses:
         """Concatenate the poses of all parts, in order."""
         none = np.zeros((0, 3))
-        eyes, gazes = [p.eyes for p in parts], [p.gazes for p in parts]
+        eyes = [p.eyes for p in parts]
+        gazes = [p.gazes for p in parts]
         return cls(np.concatenate([none, *eyes]), np.concatenate([none, *gazes]))
 
     def frames(self) -> Floats:
@@ -142,9 +143,11 @@ class Glance:
         widen = min(most, np.sqrt(represents * len(rows) / max(1, len(some))))
         shortest = np.arange(3) == np.argmin(sample.scales, axis=1)[:, None]
         logs = np.log(np.maximum(sample.scales, np.finfo(np.float32).tiny))
-        self._means, self._antialiased = means, sample.antialiased
+        self._means = means
+        self._antialiased = sample.antialiased
         self._colors = np.clip(sample.colors.astype(np.float64), 0, 1)
-        self.points, self.opacities = means + self._middle, sample.opacities
+        self.points = means + self._middle
+        self.opacities = sample.opacities
         self._arrays: tuple[NDArray[np.float32], ...] = (
             np.ascontiguousarray(means, np.float32),
             np.ascontiguousarray(sample.quats, np.float32),
@@ -187,7 +190,8 @@ class Glance:
         """
         covered, fine, detail, spread = np.zeros((4, len(cameras)))
         seen = np.zeros((len(cameras), len(self.points)), np.float32)
-        near, rasterizer = self._near_of(cameras), _core.Rasterizer()
+        near = self._near_of(cameras)
+        rasterizer = _core.Rasterizer()
         settings = RasterSettings(antialiased=self._antialiased, near=near)
         for i, (sums, depth, view) in enumerate(self._renders(cameras, near)):
             image = np.clip(rasterizer.image(self._arrays, view, settings, list(BLACK)), 0, 1)
@@ -270,7 +274,8 @@ class Survey:
     @cached_property
     def votes(self) -> Votes:
         """Votes of the scene's Gaussians for places in the site's coordinates."""
-        site, glance = self.site, self.glance
+        site = self.site
+        glance = self.glance
         points = turned((glance.points - site.origin) / site.size, site.axes)
         return Votes.of(points, glance.sizes / site.size, glance.opacities.astype(np.float64))
 
@@ -286,7 +291,8 @@ class Survey:
 
     def cameras(self, poses: Poses) -> Cameras:
         """Return cameras in world coordinates, named in order."""
-        site, lens = self.site, self.lens
+        site = self.site
+        lens = self.lens
         digits = max(4, len(str(len(poses) - 1)))
         turned = poses.frames() @ site.axes
         eyes = site.origin + site.size * (poses.eyes @ site.axes)
@@ -310,7 +316,8 @@ class Rays:
         y = tall * ((np.arange(rows) + 0.5) / rows * 2 - 1)
         rays = np.stack([np.tile(x, rows), np.repeat(y, columns), np.ones(columns * rows)], axis=1)
         rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-        self._site, self._shape = survey.site, (len(poses), len(rays))
+        self._site = survey.site
+        self._shape = (len(poses), len(rays))
         self._eyes = np.repeat(poses.eyes, len(rays), axis=0)
         self._directions = np.einsum("ri,pij->prj", rays, poses.frames()).reshape(-1, 3)
 
@@ -362,7 +369,8 @@ def gather(
             at least 1 is good.
         patience: candidates tried per requested pose, at most.
     """
-    parts, asked = [(Poses.joined([]), np.zeros(0))], 0
+    parts = [(Poses.joined([]), np.zeros(0))]
+    asked = 0
     while (good := sum(int((scores >= 1).sum()) for _, scores in parts)) < count and asked < patience * count:
         more = min(max(count - good, 16), patience * count - asked, _BLOCK)
         parts.append(tried(asked, asked + more))

@@ -272,7 +272,8 @@ class Terrain:
         top = np.array(self.heights.shape) - 1
         place = np.clip((points[:, :2] - self.low) / self.block - 0.5, 0, top)
         base = np.floor(place).astype(int)
-        share, total = place - base, np.zeros(len(points))
+        share = place - base
+        total = np.zeros(len(points))
         for step in ((0, 0), (0, 1), (1, 0), (1, 1)):
             x, y = np.minimum(base + step, top).T
             total += np.where(step, share, 1 - share).prod(axis=1) * self.heights[x, y]

@@ -116,13 +116,15 @@ def _layer(sample: Matter, axis: Floats) -> tuple[float, float, float]:
     rows = facing(sample, axis, _FACING)
     if not rows.any():
         return 0.0, 0.0, 0.0
-    heights, total = along(sample.points, axis), sample.weights.sum()
+    heights = along(sample.points, axis)
+    total = sample.weights.sum()
     bins = np.floor(heights[rows] / _SLAB).astype(int)
     low = bins.min()
     mass = np.bincount(bins - low, sample.faces[rows])
     pairs = mass + np.append(mass[1:], 0.0)
     best = int(np.argmax(pairs))
-    share, height = pairs[best] / total, (low + best + 1) * _SLAB
+    share = pairs[best] / total
+    height = (low + best + 1) * _SLAB
     above = sample.weights[heights - height > 2 * _SLAB].sum()
     below = sample.weights[heights - height < -2 * _SLAB].sum()
     edge = share * (1 - 2 * min(above, below) / max(above + below, 0.05 * total))
@@ -168,7 +170,8 @@ def _lean(sample: Matter, axis: Floats, heights: Floats) -> float:
     heights are relative to the median of the facing matter in each of 6×6 columns, so that slopes do not
     count.
     """
-    weights, flat = sample.weights, facing(sample, axis, _FACING)
+    weights = sample.weights
+    flat = facing(sample, axis, _FACING)
     faces = sample.faces[flat]
     if faces.sum() > 0:
         low, high = quantile(heights[flat], faces, [0.05, 0.95])

@@ -163,7 +163,8 @@ class Votes:
     def _closed(self, radius: float) -> float:
         """Return the share of the directions from `centre` in which matter beyond a radius stops light."""
         beyond = self.distances > radius
-        away, faces = self.points[beyond] - self.centre, self.faces[beyond]
+        away = self.points[beyond] - self.centre
+        faces = self.faces[beyond]
         angles = faces / np.square(self.distances[beyond])
         way = np.argmax(np.stack([along(away, axis) for axis in _WAYS]), axis=0)
         depth = np.bincount(way, weights=angles, minlength=len(_WAYS)) * len(_WAYS) / (4 * np.pi)
@@ -173,7 +174,8 @@ class Votes:
         """Return the distances at which gaps begin."""
         distances = self.distances
         order = np.argsort(distances, kind="stable")
-        far, total = distances[order], np.append(0.0, np.cumsum(self.weights[order]))
+        far = distances[order]
+        total = np.append(0.0, np.cumsum(self.weights[order]))
         beyond = np.searchsorted(far, _GAP * far, side="right")
         empty = total[beyond] - total[1:] < _EMPTY
         empty &= total[1:] > _LEAST  # the first rows are few anywhere

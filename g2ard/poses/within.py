@@ -127,7 +127,8 @@ def plan_inside(survey: Survey, count: int) -> Poses:
     Every second pose stands where there is most clearance. Gazes into a near wall, or out of the scene, are
     dropped.
     """
-    site, places = survey.site, survey.inside.places
+    site = survey.site
+    places = survey.inside.places
     wide = max(1, int(_WIDE * len(places)))
 
     def tried(start: int, stop: int) -> tuple[Poses, Floats]:
@@ -146,7 +147,8 @@ def plan_walk(survey: Survey, count: int, shift: int = 0, *, indoors: bool | Non
     Gazes into a near wall or leaves, or out of the scene, are dropped. `indoors`, places lie between walls;
     otherwise under an open sky. None means indoors if the scene is a room.
     """
-    site, room_like = survey.site, is_room(survey)
+    site = survey.site
+    room_like = is_room(survey)
     indoors = room_like if indoors is None else indoors
     heights = _UNDER_A_DOME if indoors and not room_like else _EYES[indoors]
     sides = site.box[1] - site.box[0]
@@ -185,7 +187,8 @@ def _together(site: Site, points: Floats) -> NDArray[np.bool_]:
     count = len(points)
     apart = sum((column[:, None] - column) ** 2 for column in points.T)
     near = np.argsort(apart, axis=1, kind="stable")[:, 1:13]
-    start, stop = np.repeat(np.arange(count), near.shape[1]), near.ravel()
+    start = np.repeat(np.arange(count), near.shape[1])
+    stop = near.ravel()
     ways = points[stop] - points[start]
     lengths = np.linalg.norm(ways, axis=1)
     seen = site.grid.cast(points[start], ways / np.where(lengths > 0, lengths, 1.0)[:, None]) >= lengths
@@ -233,7 +236,8 @@ def plan_anywhere(survey: Survey, count: int) -> Poses:
         distances = diagonal * _DISTANCES[0] * (_DISTANCES[1] / _DISTANCES[0]) ** far
         poses = Poses(points[aims] - distances[:, None] * gazes, gazes)
         free = site.grid.cast(poses.eyes, gazes) > distances - 2 * site.grid.cell
-        poses, close = poses.take(free), _CLOSE * diagonal * site.size
+        poses = poses.take(free)
+        close = _CLOSE * diagonal * site.size
         poses = poses.take(glance.clear(survey.cameras(poses), aims[free], close) >= _CLEAR)
         return poses, (glance.murk(survey.cameras(poses), close) <= _MURK).astype(float)
 
@@ -247,9 +251,11 @@ def reach_of(survey: Survey, poses: Poses) -> Reach:
         (K,) indices of the poses, −1 if none sees the point; (K,) distances from them, inf if none does; and
         (K,) whether a point is seen, but with a standard deviation below a pixel.
     """
-    site, lens = survey.site, survey.lens
+    site = survey.site
+    lens = survey.lens
     points = site.points[:_SAMPLE]
-    best, nearest = np.full(len(points), -1), np.full(len(points), np.inf)
+    best = np.full(len(points), -1)
+    nearest = np.full(len(points), np.inf)
     wide, tall = lens.tangents
     for i, frame in enumerate(poses.frames()):
         away = points - poses.eyes[i]
@@ -270,13 +276,15 @@ def plan_near(survey: Survey, poses: Poses, reach: Reach, count: int, shift: int
     Each pose stands where its point has a standard deviation of 1.5 pixels, at 0.25–0.6 of the original
     distance. Up to half of the poses look at points that the given poses show smaller than a pixel.
     """
-    site, (best, distance, coarse) = survey.site, reach
+    site = survey.site
+    (best, distance, coarse) = reach
     chance = np.random.default_rng(survey.seed + shift)
     small = chance.permutation(np.flatnonzero(coarse))[: count // 2]
     others = chance.permutation(np.setdiff1d(np.flatnonzero(best >= 0), small))
     rows = np.concatenate([small, others])
     turn, rise = halton(0, len(rows), 2, survey.seed + shift + 3).T
-    eyes, points = poses.eyes[best[rows]], site.points[rows]
+    eyes = poses.eyes[best[rows]]
+    points = site.points[rows]
     wanted = site.grid.scale_at(points) * float(survey.lens.matrix[0, 0]) / _PIXELS
     share = np.clip(wanted / distance[rows], *_STEP)
     eyes = points + share[:, None] * (eyes - points)
@@ -305,7 +313,8 @@ def plan_beyond(survey: Survey, poses: Poses, points: Floats, count: int) -> Pos
     Each looks at a point that none before has in its frame, from where near matter hides little of the view.
     """
     chances = halton(0, max(1, count), 2, survey.seed + 6)
-    missing, found = points, Poses.joined([])
+    missing = points
+    found = Poses.joined([])
     for aim, place in chances[:count]:
         if not len(missing):
             missing = points

@@ -43,7 +43,8 @@ def zoomed(scene: Splats, cameras: Cameras, *, represents: float = 1.0, share: f
     points = some.means.astype(np.float64) + some.offset
     axes = np.sort(some.scales.astype(np.float64), axis=1)
     sizes = np.sqrt(axes[:, 1] * axes[:, 2] / represents)
-    small, seen = [], 0
+    small = []
+    seen = 0
     for view in cameras:
         rows = np.flatnonzero(view.holds(points))
         depths = along(points[rows], view.viewmat[2, :3]) + view.viewmat[2, 3]

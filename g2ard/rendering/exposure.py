@@ -98,8 +98,10 @@ def _beyond(alpha: NDArray[np.float32] | None, background: Background) -> NDArra
 
 def _moments(image: NDArray[np.float32], targets: Targets, view: int, background: Background) -> Moments:
     """Compare a render, not clipped, with a photo where neither too bright nor too dark to tell."""
-    photo, alpha = targets[view], alpha_of(targets, view)
-    beyond, mask = _beyond(alpha, background), mask_of(targets, view)
+    photo = targets[view]
+    alpha = alpha_of(targets, view)
+    beyond = _beyond(alpha, background)
+    mask = mask_of(targets, view)
     counts = ((photo > _BLACK) & (photo < _SATURATED)).astype(np.float64)
     if mask is not None:
         counts *= mask[..., None]
@@ -121,10 +123,12 @@ def rendered(renderer: Renderer, targets: Targets, view: int) -> NDArray[np.floa
     channel that fit it best to its photo."""
     if not isinstance(targets, Exposed) or against_of(targets, view) != "photo":
         return renderer.clipped(targets.cameras[view])
-    image, background = renderer.image(targets.cameras[view]), renderer.background
+    image = renderer.image(targets.cameras[view])
+    background = renderer.background
     gain, offset = _moments(image, targets, view, background).fit().T.astype(np.float32)
     alpha = alpha_of(targets, view)
-    beyond, cover = _beyond(alpha, background), np.float32(1) if alpha is None else alpha[..., None]
+    beyond = _beyond(alpha, background)
+    cover = np.float32(1) if alpha is None else alpha[..., None]
     return np.clip((image - beyond) * gain + offset * cover + beyond, 0, 1)
 
 
@@ -135,9 +139,12 @@ def unexposed(
 
     Pixels that a brighter exposure saturated do not count.
     """
-    photo, mask, alpha = targets[view], mask_of(targets, view), alpha_of(targets, view)
+    photo = targets[view]
+    mask = mask_of(targets, view)
+    alpha = alpha_of(targets, view)
     gain, offset = exposure.T.astype(np.float32)
-    beyond, cover = _beyond(alpha, background), np.float32(1) if alpha is None else alpha[..., None]
+    beyond = _beyond(alpha, background)
+    cover = np.float32(1) if alpha is None else alpha[..., None]
     lost = ((photo >= _SATURATED) & (gain > 1)).any(2)
     if alpha is not None:
         lost &= alpha > 0

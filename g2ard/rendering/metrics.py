@@ -28,7 +28,8 @@ def psnr(image: _Image, target: _Image, mask: NDArray[np.bool_] | None = None) -
     20.0
     """
     if mask is not None:
-        image, target = image[mask][:, None], target[mask][:, None]
+        image = image[mask][:, None]
+        target = target[mask][:, None]
     return float(np.minimum(100.0, _core.psnr(_float32(image), _float32(target))))
 
 
@@ -45,7 +46,8 @@ def edge_psnr(image: _Image, target: _Image, mask: NDArray[np.bool_] | None = No
     >>> edge_psnr(flat, shifted), round(edge_psnr(flat, line), 2)
     (100.0, 18.75)
     """
-    total, count = 0.0, 0
+    total = 0.0
+    count = 0
     for own, wanted in _steps(image, target, mask):
         total += float(np.square(own - wanted).sum(dtype=np.float64))
         count += own.size
@@ -119,12 +121,14 @@ def lost_detail(image: _Image, target: _Image, mask: NDArray[np.bool_] | None = 
     mean = _boxed(wanted)
     own, wanted = ((pixels - _boxed(pixels)) / (mean + _GLARE) for pixels in (own, wanted))
     if mask is not None:
-        own, wanted = own * mask, wanted * mask
+        own = own * mask
+        wanted = wanted * mask
     contrast = np.sqrt(_by_region(wanted * wanted))
     visible = contrast > _SEEN_CONTRAST
     if not visible.any():
         return 0.0
-    contrast, shown = contrast[visible], _by_region(own * wanted)[visible]
+    contrast = contrast[visible]
+    shown = _by_region(own * wanted)[visible]
     lost = np.maximum(contrast - shown / contrast, 0)
     noticed = _SEEN_CONTRAST * (contrast / _SEEN_CONTRAST) ** _MASKING
     return float(np.quantile(lost / noticed, 0.99))
@@ -159,7 +163,8 @@ def _boxed(pixels: NDArray[np.float64]) -> NDArray[np.float64]:
 def _by_region(pixels: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the means of the regions, the last of which may be smaller."""
     height, width = pixels.shape
-    rows, columns = np.arange(0, height, _REGION), np.arange(0, width, _REGION)
+    rows = np.arange(0, height, _REGION)
+    columns = np.arange(0, width, _REGION)
     sums = np.add.reduceat(np.add.reduceat(pixels, rows, 0), columns, 1)
     areas = np.diff(rows, append=height)[:, None] * np.diff(columns, append=width)
     return sums / areas
@@ -229,7 +234,8 @@ class Lpips:
         *,
         scaled: bool = True,
     ) -> None:
-        self.net, self.scaled = net, scaled
+        self.net = net
+        self.scaled = scaled
         try:
             self._layers = {
                 i: [backbone[f"features.{i}.{name}"] for name in ("weight", "bias")] for i in _CONV[net]

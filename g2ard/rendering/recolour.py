@@ -78,7 +78,8 @@ def shifted(
         image, alpha = shown(view)
         rasterizer, camera = _core.Rasterizer(), view_of(cameras, view, settings)
         own_image, opacity, *_ = _drawn(rasterizer, arrays, camera, settings)
-        alpha, own_alpha = alpha[..., None], opacity[..., None]
+        alpha = alpha[..., None]
+        own_alpha = opacity[..., None]
         error = own_alpha * image - alpha * own_image
         weight = np.broadcast_to(alpha * own_alpha, image.shape)
         found = [rasterizer.backward(arrays, np.ascontiguousarray(a))[4] for a in (error, weight)]
@@ -86,7 +87,8 @@ def shifted(
 
     error = weight = np.zeros_like(arrays[4], np.float64)
     for found in in_threads(sums, range(len(views))):
-        error, weight = error + found[0], weight + found[1]
+        error = error + found[0]
+        weight = weight + found[1]
     shift = error / np.maximum(weight + _FLOOR * weight.mean(), np.finfo(np.float64).tiny)
     return replace(small, sh0=(small.sh0 + shift / SH_C0).astype(np.float32))
 

@@ -218,7 +218,8 @@ class Renderer:
         Raises:
             InputError: an invalid camera, see `Cameras`.
         """
-        view, depths = self._view(camera), 2 if median else 1
+        view = self._view(camera)
+        depths = 2 if median else 1
         image, alpha, depth, middle = self._rasterizer.forward(
             self._arrays, view, self._settings, self.background, depths, self._bounds
         )
@@ -390,7 +391,8 @@ def _sampled(
     picture: _Floats, side: int, u: NDArray[np.float64], v: NDArray[np.float64]
 ) -> NDArray[np.float32]:
     """Sample a square picture, (side², C), bilinearly at pixels u, v."""
-    left, above = np.floor(u - 0.5).astype(int), np.floor(v - 0.5).astype(int)
+    left = np.floor(u - 0.5).astype(int)
+    above = np.floor(v - 0.5).astype(int)
     right = (u - 0.5 - left)[:, None].astype(np.float32)
     down = (v - 0.5 - above)[:, None].astype(np.float32)
     at = above * side + left

@@ -83,7 +83,8 @@ def scored_in(targets: Targets, split: str = "") -> str:
     >>> scored_in(Photos(views, [np.zeros((48, 64, 3), np.uint8)]), "test")
     '1 test photo, 64×48 px'
     """
-    count, kinds = len(targets.cameras), kinds_of(targets)
+    count = len(targets.cameras)
+    kinds = kinds_of(targets)
     name = f"{split} {'photo' if kinds == 'photos' else 'view'}".strip()
     against = "" if kinds == "photos" else f" against {kinds}"
     exposed = ", exposure fitted" * isinstance(targets, Exposed)
@@ -138,7 +139,8 @@ def as_image(image: Any, cameras: Cameras, view: int, parameter: str) -> NDArray
     if hasattr(image, "detach"):
         image = image.detach().cpu().numpy()
     array = np.asarray(image)
-    height, width = int(cameras.heights[view]), int(cameras.widths[view])
+    height = int(cameras.heights[view])
+    width = int(cameras.widths[view])
     hint = None
     if array.shape not in ((height, width, 3), (height, width, 4)):
         wrong = f"expected shape ({height}, {width}, 3), got {array.shape}"
@@ -151,7 +153,8 @@ def as_image(image: Any, cameras: Cameras, view: int, parameter: str) -> NDArray
     elif array.dtype.kind != "f":
         wrong = f"expected uint8, or floats from 0 to 1, got {array.dtype}"
     else:
-        least, most = float(array.min()), float(array.max())
+        least = float(array.min())
+        most = float(array.max())
         if least >= -_ROUNDING and most <= 1 + _ROUNDING:
             inside = least >= 0 and most <= 1
             return np.asarray(array if inside else array.clip(0, 1), np.float32)
@@ -198,7 +201,8 @@ class _Chosen(_Sourced):
     """
 
     def __init__(self, cameras: Cameras, places: Sequence[tuple[Targets, int]]) -> None:
-        self.cameras, self._places = cameras, places
+        self.cameras = cameras
+        self._places = places
 
     def _given(self) -> Sequence[Any]:
         """Return the sources of the other targets, and which of them has each view in which row."""
@@ -502,7 +506,8 @@ class TeacherRenders(Cached):
         pixels = int((cameras.widths.astype(np.int64) * cameras.heights).sum())
         self._rounded = 3 * np.float32().nbytes * pixels + teacher.nbytes > limit
         self._teacher = teacher
-        self._background, self._settings = background, settings
+        self._background = background
+        self._settings = settings
         self._renderer = renderer
         if not lazy:
             self.fill(progress)
@@ -528,7 +533,8 @@ class TeacherRenders(Cached):
     def _shared_renderer(self) -> Renderer:
         with _KEEPING:
             if self._renderer is None:
-                teacher, background = self._teacher, self._background
+                teacher = self._teacher
+                background = self._background
                 self._renderer = Renderer(teacher, background=background, settings=self._settings)
             return self._renderer
 

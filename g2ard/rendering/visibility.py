@@ -186,7 +186,8 @@ class _Sampler:
         """Add rounds while they are cheap or find new Gaussians; return their number."""
         number = seen = 0
         for number, views in enumerate(self.rounds, 1):
-            before, seen = seen, self._add(sums, cameras, views)
+            before = seen
+            seen = self._add(sums, cameras, views)
             converged = number > 1 and seen - before < CONVERGED * rows
             cheap = number * ROUND * rows < _FREE_GAUSSIAN_VIEWS
             if converged and not cheap:

@@ -64,7 +64,8 @@ def ticks(low: float, high: float, *, log: bool = False) -> list[float]:
     ([0, 2, 4, 6, 8, 10], [1, 2, 5, 10, 20, 50, 100])
     """
     if log:
-        first, last = math.floor(math.log10(low)), math.ceil(math.log10(high))
+        first = math.floor(math.log10(low))
+        last = math.ceil(math.log10(high))
         steps = (1, 2, 5) if last - first <= 4 else (1,)
         values = [m * 10.0**e for e in range(first, last + 1) for m in steps]
         return [_neat(v) for v in values if low * 0.999 <= v <= high * 1.001]
@@ -83,19 +84,29 @@ class _Axis:
     """Map from values to pixels."""
 
     def __init__(self, values: Sequence[float], start: float, end: float, *, log: bool) -> None:
-        self.log, self._start, self._end = log, start, end
-        low, high = min(values), max(values)
+        self.log = log
+        self._start = start
+        self._end = end
+        low = min(values)
+        high = max(values)
         if log:
-            low, high = low / 1.15, high * 1.15
+            low = low / 1.15
+            high = high * 1.15
         else:
             room = 0.06 * (high - low) or 0.5
-            low, high = low - room, high + room
-        self.low, self.high = low, high
+            low = low - room
+            high = high + room
+        self.low = low
+        self.high = high
 
     def __call__(self, value: float) -> float:
-        low, high, at = self.low, self.high, value
+        low = self.low
+        high = self.high
+        at = value
         if self.log:
-            low, high, at = math.log(low), math.log(high), math.log(value)
+            low = math.log(low)
+            high = math.log(high)
+            at = math.log(value)
         return self._start + (self._end - self._start) * (at - low) / (high - low)
 
 
@@ -206,10 +217,13 @@ def _names(points: Sequence[Point], x: _Axis, y: _Axis) -> list[str]:
     out: list[str] = []
     taken: list[tuple[float, float, float]] = []
     for point in sorted((p for p in points if p.label), key=lambda p: -p.y):
-        width, left = 6.2 * len(point.label), x(point.x) + 9
-        anchor, at = "start", left
+        width = 6.2 * len(point.label)
+        left = x(point.x) + 9
+        anchor = "start"
+        at = left
         if left + width > _WIDTH - _RIGHT:
-            anchor, at = "end", x(point.x) - 9
+            anchor = "end"
+            at = x(point.x) - 9
             left = at - width
         bottom = y(point.y) - 6
         if any(left < right and start < left + width and abs(bottom - b) < 12 for start, right, b in taken):

@@ -56,7 +56,8 @@ class Drawn:
     """
 
     def __init__(self, best: Targets, parts: Sequence[Targets]) -> None:
-        self.best, self.parts = best, parts
+        self.best = best
+        self.parts = parts
         self._shown = set(map(_key, best.cameras))
         self._scored = {_key(view): view.kind for part in parts for view in part.cameras}
         self._worst: dict[str, list[tuple[float, _Key]]] = {kind: [] for kind in self._scored.values()}
@@ -69,7 +70,8 @@ class Drawn:
         key = _key(targets.cameras[view])
         wanted = key in self._shown or key in self._kept
         if scene == RESULT and key in self._scored:
-            worst, most = self._worst[score.kind], math.ceil(_SHOWN / len(self._worst))
+            worst = self._worst[score.kind]
+            most = math.ceil(_SHOWN / len(self._worst))
             worst.append((score.psnr, key))
             worst.sort(key=lambda one: one[0])
             gone = {other for _, other in worst[most:]} - self._shown
@@ -107,7 +109,8 @@ def pictures(
             black. None leaves the background.
         drawn: pictures that need no render.
     """
-    mask, target = mask_of(targets, view), targets[view]
+    mask = mask_of(targets, view)
+    target = targets[view]
     known = {} if drawn is None else drawn.of(targets, view)
 
     def shown_of(name: str) -> tuple[NDArray[np.uint8], float]:
@@ -162,7 +165,8 @@ def distill_report(
     views = [(part, row) for part in drawn.parts for row in range(len(part.cameras))]
     parts = [part for part in (report.scores, report.apart) if part]
     scores = {name: [view for part in parts for view in part[name].views] for name in report.scores}
-    before, after = scores["simplified"], scores["recovered"]
+    before = scores["simplified"]
+    after = scores["recovered"]
     scores[RESULT] = after
 
     def show(view: Pictures) -> None:

@@ -57,7 +57,8 @@ def worst_windows(image: NDArray[np.uint8], target: NDArray[np.uint8]) -> list[W
     """Return the windows with the largest error, worst first, in shares of the image's size."""
     error = ((image.astype(np.float64) - target) ** 2).sum(-1)
     height, width = error.shape
-    rows, columns = max(1, int(_WINDOW * height)), max(1, int(_WINDOW * width))
+    rows = max(1, int(_WINDOW * height))
+    columns = max(1, int(_WINDOW * width))
     total = np.pad(error, ((1, 0), (1, 0))).cumsum(0).cumsum(1)
     sums = (
         total[rows:, columns:] - total[:-rows, columns:] - total[rows:, :-columns] + total[:-rows, :-columns]
@@ -111,7 +112,8 @@ class Page:
     ) -> None:
         """Add a table; cells (row, column) in `best` are bold."""
         head = "".join(f"<th>{escape(name)}</th>" for name in columns)
-        body, mark = [], ' class="best"'
+        body = []
+        mark = ' class="best"'
         for i, row in enumerate(rows):
             cells = "".join(
                 f'<td data-column="{escape(name)}"{mark * ((i, j) in best)}>{escape(cell)}</td>'
@@ -124,7 +126,8 @@ class Page:
         )
 
     def figure(self, image: NDArray[np.uint8], caption: str) -> None:
-        number, text = self._image(image), escape(caption)
+        number = self._image(image)
+        text = escape(caption)
         self._parts.append(
             f'<figure class="wide"><img data-i="{number}" alt="{text}">'
             f"<figcaption>{text}</figcaption></figure>"
@@ -170,7 +173,8 @@ class Page:
     def _crop(self, shown: Shown, window: Window) -> str:
         rows, columns = pixels(window, *shown.image.shape[:2])
         crop = shown.image[rows, columns]
-        number, ratio = self._image(crop), crop.shape[1] / crop.shape[0]
+        number = self._image(crop)
+        ratio = crop.shape[1] / crop.shape[0]
         return (
             f'<figure class="crop" style="max-width:min(300px,38vh*{ratio:.4f})">'
             f'<img data-i="{number}" alt="{escape(shown.name)}">'

@@ -58,7 +58,8 @@ def registration_report(
     seen = [i for i, row in enumerate(rows) if row.camera_from_world is not None]
     renderer = Renderer(scene, background=background)
     for i in sorted(seen, key=lambda i: -1.0 if (zncc := rows[i].zncc) is None else zncc)[:_VIEWS]:
-        row, one = rows[i], cameras.take([i]).resized(_SIZE)
+        row = rows[i]
+        one = cameras.take([i]).resized(_SIZE)
         try:
             photo = to_bytes(load_photo(one, 0, background)[0])
         except InputError:
@@ -85,7 +86,8 @@ def _matches_drawn(
     from PIL import Image, ImageDraw
 
     pair = Image.fromarray(np.concatenate([photo, render], 1))
-    pen, width = ImageDraw.Draw(pair), photo.shape[1]
+    pen = ImageDraw.Draw(pair)
+    width = photo.shape[1]
     every = max(1, -(-len(matches) // _LINES))
     for k, (u, v, u_seen, v_seen) in enumerate(matches[::every].tolist()):
         colour = f"hsl({137 * k % 360}, 90%, 55%)"  # steps of the golden angle, so neighbours differ

@@ -30,7 +30,8 @@ def contact_sheet(
     widths = [max(row[c].width for row in grid if c < len(row)) for c in range(columns)]
     heights = [max((cell.height for cell in row), default=0) for row in grid]
     text = max(11, min(28, max(widths) // 20))
-    font, line = ImageFont.load_default(text), round(1.6 * text)
+    font = ImageFont.load_default(text)
+    line = round(1.6 * text)
     for c, label in enumerate(labels[:columns]):
         widths[c] = max(widths[c], math.ceil(font.getlength(label)))
     longest = max((math.ceil(font.getlength(caption)) for caption in row_labels), default=0)

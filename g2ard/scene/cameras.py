@@ -134,9 +134,11 @@ class Camera(Shown):
     def outward(self, points: ArrayLike) -> NDArray[np.float64]:
         """Return how far from the middle of the image (N, 3) world points lie: 1 at its edge, inf behind."""
         x, y, z = self.viewmat[:3, :3] @ (np.asarray(points, np.float64) - self.position).T
-        K, front = self.K, z > 0
+        K = self.K
+        front = z > 0
         ahead = np.where(front, z, 1.0)
-        u, v = K[0, 0] * x / ahead + K[0, 2], K[1, 1] * y / ahead + K[1, 2]
+        u = K[0, 0] * x / ahead + K[0, 2]
+        v = K[1, 1] * y / ahead + K[1, 2]
         away = np.maximum(np.abs(2 * u / self.width - 1), np.abs(2 * v / self.height - 1))
         return np.where(front, away, np.inf)
 
@@ -206,11 +208,13 @@ class Cameras(Shown):
 
     def _faults(self, scales: NDArray[np.float64]) -> dict[str, NDArray[np.bool_]]:
         """Return the (C,) mask of each fault, the most basic first; keys are templates of messages."""
-        n, rotations = len(self), self.viewmats[:, :3, :3]
+        n = len(self)
+        rotations = self.viewmats[:, :3, :3]
         values = np.hstack([self.viewmats.reshape(n, 16), self.Ks.reshape(n, 9), self.distortions])
         largest = np.abs(values).max(1)
         last_row = np.abs(self.viewmats[:, 3] - (0, 0, 0, 1)).max(1)
-        square, unit = rotations @ rotations.transpose(0, 2, 1), scales**2
+        square = rotations @ rotations.transpose(0, 2, 1)
+        unit = scales**2
         skew = np.abs(square - unit[:, None, None] * np.eye(3)).max((1, 2))
         pose = "has a pose that {}; expected a rotation and a translation".format
         return {
@@ -274,7 +278,8 @@ class Cameras(Shown):
     @property
     def positions(self) -> NDArray[np.float64]:
         """Camera centres in world coordinates, (C, 3)."""
-        R, t = self.viewmats[:, :3, :3], self.viewmats[:, :3, 3]
+        R = self.viewmats[:, :3, :3]
+        t = self.viewmats[:, :3, 3]
         return -np.einsum("cji,cj->ci", R, t)
 
     @property

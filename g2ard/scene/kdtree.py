@@ -35,7 +35,8 @@ class KdTree:
         """Return the (leaves, 2, 3) low and high corners, infinite where nothing was cut."""
         boxes = [np.array([[-np.inf] * 3, [np.inf] * 3])]
         if self.below and self.above:
-            below, above = self.below.boxes(), self.above.boxes()
+            below = self.below.boxes()
+            above = self.above.boxes()
             below[:, 1, self.axis] = np.minimum(below[:, 1, self.axis], self.at)
             above[:, 0, self.axis] = np.maximum(above[:, 0, self.axis], self.at)
             boxes = [*below, *above]
@@ -46,7 +47,8 @@ class KdTree:
 
         A point is within the margin if it lies in the box after all sides move outwards by `margin`.
         """
-        core, halo = np.arange(len(points)), np.empty(0, np.intp)
+        core = np.arange(len(points))
+        halo = np.empty(0, np.intp)
         columns = tuple(np.ascontiguousarray(points.T))
         yield from self._route(columns, core, halo, margin)
 
@@ -56,13 +58,17 @@ class KdTree:
         if not (self.below and self.above):
             yield core, np.sort(halo)
             return
-        values, outer = columns[self.axis][core], columns[self.axis][halo]
-        low, high = np.float32(self.at - margin), np.float32(self.at + margin)
+        values = columns[self.axis][core]
+        outer = columns[self.axis][halo]
+        low = np.float32(self.at - margin)
+        high = np.float32(self.at + margin)
         inside = values < np.float32(self.at)
-        left, right = core[inside], core[~inside]
+        left = core[inside]
+        right = core[~inside]
         near_left = near_right = core[:0]
         if margin > 0:
-            near_left, near_right = core[~inside & (values <= high)], core[inside & (values >= low)]
+            near_left = core[~inside & (values <= high)]
+            near_right = core[inside & (values >= low)]
         halo_left = np.concatenate([halo[outer <= high], near_left])
         halo_right = np.concatenate([halo[outer >= low], near_right])
         yield from self.below._route(columns, left, halo_left, margin)
@@ -159,7 +165,8 @@ class Sampler:
 
     def __init__(self, count: int, size: int) -> None:
         self._limit = min(1 << 32, max(1, (size << 32) // max(1, count)))
-        self._most, self._held = 2 * size, 0
+        self._most = 2 * size
+        self._held = 0
         self._points: list[Points] = []
         self._hashes: list[NDArray[np.uint32]] = []
 
@@ -174,9 +181,11 @@ class Sampler:
         self._held += len(self._points[-1])
         while self._held > self._most and self._limit > 1:
             self._limit //= 2
-            points, hashes = np.concatenate(self._points), np.concatenate(self._hashes)
+            points = np.concatenate(self._points)
+            hashes = np.concatenate(self._hashes)
             stay = hashes < np.uint32(self._limit)
-            self._points, self._hashes = [points[stay]], [hashes[stay]]
+            self._points = [points[stay]]
+            self._hashes = [hashes[stay]]
             self._held = len(self._points[0])
 
     def result(self) -> tuple[Points, float]:

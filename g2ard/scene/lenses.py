@@ -96,7 +96,8 @@ class PhotoLens:
         aim = np.where(across > 0, across, 1.0)
         u, v = self._bent(x / aim * away, y / aim * away)
         cx, cy, _ = self._centre_and_rest
-        u, v = self.focal[0] * u + cx, self.focal[1] * v + cy
+        u = self.focal[0] * u + cx
+        v = self.focal[1] * v + cy
         inside &= (u >= 0) & (u <= width) & (v >= 0) & (v <= height)
         return np.stack([u, v], 1), inside
 
@@ -180,7 +181,8 @@ def _end(lens: PhotoLens) -> float:
 def panorama_rays(width: int, height: int, rows: slice) -> Float:
     """Return unit rays (N, 3) of the pixels in some rows of a panorama, in its camera's axes."""
     v, u = np.mgrid[rows, 0:width] + 0.5
-    around, down = 2 * np.pi * (u / width - 0.5), np.pi * (v / height - 0.5)
+    around = 2 * np.pi * (u / width - 0.5)
+    down = np.pi * (v / height - 0.5)
     aside = np.cos(down)
     return np.stack([np.sin(around) * aside, np.sin(down), np.cos(around) * aside], axis=-1).reshape(-1, 3)
 

@@ -92,11 +92,13 @@ def sky_mask(splats: Splats) -> NDArray[np.bool_]:
     opacities = splats.opacities.astype(np.float64)
     rows = np.flatnonzero(splats.finite_rows() & (opacities > 1 / 255))
     rows = rows[:: max(1, -(-len(rows) // _RADIUS_SAMPLE))]
-    middle, reach = np.zeros(3), np.inf
+    middle = np.zeros(3)
+    reach = np.inf
     for _ in range(4):  # without the sky, which moves the middle and widens the radius
         if not len(rows):
             break
-        means, weights = splats.means[rows].astype(np.float64), opacities[rows]
+        means = splats.means[rows].astype(np.float64)
+        weights = opacities[rows]
         middle = np.array([weighted_quantile(means[:, axis], weights, 0.5) for axis in range(3)])
         away = np.linalg.norm(means - middle, axis=1)
         reach = _SKY_RADII * weighted_quantile(away, weights, _NEAR_SHARE)

@@ -40,11 +40,13 @@ def joined(root: NDArray[np.int64], a: NDArray[Any], b: NDArray[Any]) -> NDArray
     """
     root = root.copy()
     while True:
-        a, b = root[a], root[b]
+        a = root[a]
+        b = root[b]
         apart = a != b
         if not apart.any():
             return root
-        a, b = a[apart], b[apart]
+        a = a[apart]
+        b = b[apart]
         np.minimum.at(root, np.maximum(a, b), np.minimum(a, b))
         while not np.array_equal(further := root[root], root):
             root = further
@@ -92,7 +94,8 @@ def around(vector: Floats, angles: Floats) -> Floats:
     [[1.0, 0.0, 5.0], [0.0, 1.0, 5.0], [-1.0, 0.0, 5.0]]
     """
     x, y, z = vector
-    cosine, sine = np.cos(angles), np.sin(angles)
+    cosine = np.cos(angles)
+    sine = np.sin(angles)
     return np.stack([x * cosine - y * sine, x * sine + y * cosine, np.full(len(angles), z)], axis=1)
 
 
@@ -114,7 +117,8 @@ def halton(start: int, stop: int, dimensions: int, seed: int) -> Floats:
     shift = np.random.default_rng(seed).random(dimensions)
     columns = np.empty((stop - start, dimensions))
     for column, base in zip(columns.T, (2, 3, 5, 7, 11, 13), strict=False):
-        index, share = np.arange(start + 1, stop + 1), 1.0
+        index = np.arange(start + 1, stop + 1)
+        share = 1.0
         column[:] = 0
         while index.any():
             share /= base

@@ -54,7 +54,8 @@ def transform(splats: Splats, matrix: ArrayLike) -> Splats:
     if splats.offset.any() or far:
         offset = offset + shift
     else:
-        means, offset = means + shift, np.zeros(3)
+        means = means + shift
+        offset = np.zeros(3)
     w, x, y, z = quaternion_of(rotation)
     turn = np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
     return replace(
@@ -76,7 +77,8 @@ def moving(scale: float, degrees: Sequence[float], shift: Sequence[float]) -> ND
     """
     rotation = np.eye(3)
     for axis, angle in enumerate(np.radians(degrees)):
-        turn, (a, b) = np.eye(3), ((1, 2), (2, 0), (0, 1))[axis]
+        turn = np.eye(3)
+        (a, b) = ((1, 2), (2, 0), (0, 1))[axis]
         turn[a, a] = turn[b, b] = np.cos(angle)
         turn[b, a], turn[a, b] = np.sin(angle), -np.sin(angle)
         rotation = turn @ rotation
@@ -131,7 +133,8 @@ def _warped(shN: NDArray[np.float32], linear: NDArray[np.float64]) -> NDArray[np
     before = directions @ np.linalg.inv(linear).T
     before /= np.linalg.norm(before, axis=1, keepdims=True)
     rest = shN.shape[1]
-    here, there = _basis(directions)[:, :rest], _basis(before)[:, :rest]
+    here = _basis(directions)[:, :rest]
+    there = _basis(before)[:, :rest]
     turn = np.linalg.lstsq(here, there, rcond=None)[0]
     return np.einsum("kj,njc->nkc", turn, shN.astype(np.float64)).astype(np.float32)
 
@@ -141,7 +144,8 @@ def _quaternions(rotations: NDArray[np.float64]) -> NDArray[np.float32]:
     r = rotations
     trace = r[:, 0, 0] + r[:, 1, 1] + r[:, 2, 2]
     squares = np.stack([trace, *(2 * r[:, i, i] - trace for i in range(3))], axis=1) + 1
-    rows, largest = np.arange(len(r)), squares.argmax(axis=1)
+    rows = np.arange(len(r))
+    largest = squares.argmax(axis=1)
     products = np.empty((len(r), 4, 4))
     for i in range(4):
         products[:, i, i] = squares[:, i]
@@ -221,7 +225,8 @@ def rotate_harmonics(shN: NDArray[np.float32], rotation: NDArray[np.float64]) ->
     out = np.empty_like(shN)
     directions = np.random.default_rng(0).normal(size=(64, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    here, there = _basis(directions), _basis(directions @ rotation)
+    here = _basis(directions)
+    there = _basis(directions @ rotation)
     for band in range(1, 4):
         rows = slice(band * band - 1, (band + 1) ** 2 - 1)
         if rows.stop > shN.shape[1]:
@@ -244,9 +249,16 @@ def harmonic_signs(axes: Iterable[float]) -> NDArray[np.float32]:
 def _basis(d: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the (N, 15) real harmonics of bands 1 to 3 at unit vectors."""
     x, y, z = d.T
-    xx, yy, zz = x * x, y * y, z * z
-    a, b, c = 1.0925484305920792, 0.31539156525252005, 0.5462742152960396
-    e, f, g, h = 0.5900435899266435, 2.890611442640554, 0.4570457994644658, 0.3731763325901154
+    xx = x * x
+    yy = y * y
+    zz = z * z
+    a = 1.0925484305920792
+    b = 0.31539156525252005
+    c = 0.5462742152960396
+    e = 0.5900435899266435
+    f = 2.890611442640554
+    g = 0.4570457994644658
+    h = 0.3731763325901154
     columns: list[Any] = [
         *(-0.4886025119029199 * y, 0.4886025119029199 * z, -0.4886025119029199 * x),
         *(a * x * y, -a * y * z, b * (2 * zz - xx - yy), -a * x * z, c * (xx - yy)),
@@ -279,7 +291,8 @@ def with_axes(splats: Splats, matrix: NDArray[np.float64]) -> Splats:
     their w and permute the rest like a vector, with all digits, and no rotation is rounded.
     """
     sign = np.sign(np.linalg.det(matrix))
-    axis, places = matrix.astype(np.float32), np.abs(matrix).argmax(axis=1)
+    axis = matrix.astype(np.float32)
+    places = np.abs(matrix).argmax(axis=1)
     quats = np.concatenate([splats.quats[:, :1], splats.quats[:, 1:] @ (np.float32(sign) * axis).T], axis=1)
     shN = rotate_harmonics(splats.shN, sign * matrix)
     if sign < 0:

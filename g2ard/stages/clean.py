@@ -153,13 +153,17 @@ def compare_depths(
         The (N,) mask of unoccluded means, and if wanted two (N,) shares of the views in which a Gaussian
         floats: with its mean, and with that of its ends (2σ) which floats more often, 0 without ends.
     """
-    count, points, owners = len(splats), splats.means.astype(np.float64), np.arange(len(splats))
+    count = len(splats)
+    points = splats.means.astype(np.float64)
+    owners = np.arange(len(splats))
     if floating:
         long, mean_to_end = _elongated(splats, owners)
         points = np.concatenate([points, points[long] - mean_to_end, points[long] + mean_to_end])
         owners = np.concatenate([owners, long, long])
     points += splats.offset
-    unoccluded, views, floats = np.zeros(count, bool), np.ones(len(points)), np.zeros(len(points))
+    unoccluded = np.zeros(count, bool)
+    views = np.ones(len(points))
+    floats = np.zeros(len(points))
     renderer = Renderer(splats)
     for done, camera in enumerate(cameras, 1):
         depths = renderer.render(camera, median=True).median
@@ -171,7 +175,9 @@ def compare_depths(
         if floating:
             views[rows[shown]] += 1
             front = z < (1 - _SURFACE_SLACK) * surface
-            rows, z, surface = rows[front], z[front], surface[front]
+            rows = rows[front]
+            z = z[front]
+            surface = surface[front]
             rays = points[rows] - camera.position
             rays /= np.linalg.norm(rays, axis=1, keepdims=True)
             owner = owners[rows]

@@ -185,14 +185,16 @@ def evaluate(
     >>> len(scores.views), 0 < scores.ssim < 1 < scores.psnr < 100
     (4, True)
     """
-    splats, targets = scene_of(splats), checked_targets(targets)
+    splats = scene_of(splats)
+    targets = checked_targets(targets)
     cameras = targets.cameras
     fill(targets, progress)
     renderer = Renderer(splats, background=background, settings=settings)
 
     def score(view: int) -> tuple[ViewScore, NDArray[np.float32] | None]:
         name = cameras.names[view]
-        image, target = rendered(renderer, targets, view), targets[view]
+        image = rendered(renderer, targets, view)
+        target = targets[view]
         if eight_bit:
             image, target = as_saved(image), as_saved(target)
         perceived = {net: model(image, target) for net, model in (lpips or {}).items()}

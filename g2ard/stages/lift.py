@@ -137,12 +137,15 @@ def lift_rows(
         raise InputError(f"none of the {len(xyz)} points is finite", parameter="points")
     rows = np.flatnonzero(finite)
     if not finite.all():
-        xyz, rgb = xyz[finite], rgb[finite]
+        xyz = xyz[finite]
+        rgb = rgb[finite]
     origin = middle(xyz)
     centered = xyz - origin
     if merge:
         firsts, rgb = merged(centered, rgb)
-        xyz, centered, rows = xyz[firsts], centered[firsts], rows[firsts]
+        xyz = xyz[firsts]
+        centered = centered[firsts]
+        rows = rows[firsts]
     progress("lift", 0, len(xyz))
     quats, scales = _core.lift_points(xyz - _anchor(xyz), config, counter(progress, "lift"))
     n = len(centered)

@@ -14,7 +14,8 @@ else:
         """Property computed on first use and kept in the instance's `__dict__`."""
 
         def __init__(self, compute: Any) -> None:
-            self.compute, self.__doc__ = compute, compute.__doc__
+            self.compute = compute
+            self.__doc__ = compute.__doc__
 
         def __set_name__(self, owner: type, name: str) -> None:
             self.name = name

@@ -71,7 +71,8 @@ def adapt(
     )
     _, targets = teaching.training(splats, opt.with_images(views, images, alpha), split, size)
     count = len(targets.cameras)
-    most, first = config.most_steps(count), config.stretches(count)[0]
+    most = config.most_steps(count)
+    first = config.stretches(count)[0]
     cost = cost_of_recovery(splats, targets.cameras, most, teacher=teaching.dense, stage="adapt")
     if dry_run:
         tell_plan(run, len(splats), cost)
@@ -84,7 +85,8 @@ def adapt(
         work.mkdir(parents=True, exist_ok=True)
         result = refit(splats, targets, config, work=work, progress=run.progress)
         run.write(output, result.splats)
-    gain, end = result.report.psnr, "converged" if result.report.converged else "all steps taken"
+    gain = result.report.psnr
+    end = "converged" if result.report.converged else "all steps taken"
     if result.report.exposure is not None:
         run.say(str(result.report.exposure))
     run.say(

@@ -116,7 +116,8 @@ def clean(
         progress=run.progress,
         say=run.answer if output is None else run.say,
     )
-    total, kept = len(done.before), int(done.clutter.keep.sum())
+    total = len(done.before)
+    kept = int(done.clutter.keep.sum())
     sky_count = 0 if done.sky is None else len(done.sky)
     if output is not None:
         if not kept:

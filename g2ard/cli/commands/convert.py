@@ -131,11 +131,13 @@ def convert(
     if layout is not None and sh_degree not in (None, 3):
         raise typer.BadParameter("--layout inria has SH degree 3; leave --sh-degree out")
     matrix = None if transform is None else _matrix(transform)
-    opened, points = opened_scenes(scenes, run.render_model), None
+    opened = opened_scenes(scenes, run.render_model)
+    points = None
     corners = None if box is None else numbers("--box", box, 6)
     with run.usage():
         if isinstance(opened, Source):
-            points, where = PointChoice(None if invert else corners, where, color), None
+            points = PointChoice(None if invert else corners, where, color)
+            where = None
         elif color is not None:
             points = PointChoice(color=color)
         changes = Changes(
@@ -158,7 +160,8 @@ def convert(
         options = _with_axes(options, defined, output, NAMED_AXES.get(to_axes) or cast("Axes", to_axes))
     run.begin("read")
     whole = read_merged(opened, points, from_axes, **run.callbacks)
-    splats, read = changes.apply(whole), len(whole)
+    splats = changes.apply(whole)
+    read = len(whole)
     if as_table:
         run.begin("write")
         write_table(output, splats, overwrite=run.overwrite)

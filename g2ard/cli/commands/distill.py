@@ -153,7 +153,8 @@ def distill(
         with folder.held(job):
             done: Any = job.run(folder.unfinished)
             folder.write(done, job.views, job.targets)
-            drawn, line = None, ""
+            drawn = None
+            line = ""
             with run.showing("choosing views for report.html"):
                 drawn = Drawn(job.best(done), list(filter(None, (done.held_out, job.targets.apart))))
             with run.finishing("scoring"):

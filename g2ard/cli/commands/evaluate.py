@@ -103,7 +103,8 @@ def evaluate(
     if views is None and teacher is None:
         own = common_of(scenes, background=background is not None)
     if own is not None:
-        teacher, photos = own.teacher, own.photos
+        teacher = own.teacher
+        photos = own.photos
         size = size or own.size
     else:
         with run.usage():
@@ -112,7 +113,8 @@ def evaluate(
     sources = [Source(path, run.render_model) for path in scenes]
     for source in sources:
         source.check_scene()
-    chosen, settings = opt.background_of(run, background, *scenes), RasterSettings(convention=convention)
+    chosen = opt.background_of(run, background, *scenes)
+    settings = RasterSettings(convention=convention)
     colour = chosen or BLACK
     teaching = Teaching(
         teacher,
@@ -138,7 +140,8 @@ def evaluate(
     cameras = targets.cameras
     networks = load_lpips(lpips, scaled=lpips_input == "scaled") if lpips else None
     rows: list[dict[str, Any]] = []
-    found, judged = [], []
+    found = []
+    judged = []
     loaded: list[Splats] = []
     for path, source in zip(scenes, sources, strict=True):
         splats = run.load(source)
@@ -214,7 +217,8 @@ def _write_ladder(
     from g2ard.report.ladder import Dense, Rung, labels, ladder, recommendation
 
     run.begin("page")
-    dense, cameras = teaching.dense, targets.cameras
+    dense = teaching.dense
+    cameras = targets.cameras
     top = None
     if dense is not None and teaching.teacher is not None:
         teacher = Path(str(teaching.teacher))

@@ -50,7 +50,8 @@ def info(
         return
     from g2ard.io.types import ViewFiles
 
-    found, failed = [], []
+    found = []
+    failed = []
     for path in paths:
         run.begin("read")
         try:
@@ -89,10 +90,12 @@ def _described(given: ViewFiles) -> tuple[dict[str, Any], list[list[str]]]:
             points = sparse_points(sparse_file(path), partial(_noted, figures))
             figures["sparse_points"] = 0 if points is None else len(points)
         return figures, _rows(figures)
-    figures, report = describe(scene, _overdraw), read_json(path / "report.json")
+    figures = describe(scene, _overdraw)
+    report = read_json(path / "report.json")
     against, scores = _scores(report)
     figures["run"] = {"input_count": report["input_count"], "against": against, "scores": scores}
-    photos, one = report.get("photos"), "point" if report.get("lifted") else "Gaussian"
+    photos = report.get("photos")
+    one = "point" if report.get("lifted") else "Gaussian"
     rows = [["made from", plural(photos, "photo") if photos else plural(report["input_count"], one)]]
     figures["run"]["overdraw"] = report["overdraw"]
     rows.append(["Gaussians per pixel, held-out", f"{report['overdraw']:.1f}"])

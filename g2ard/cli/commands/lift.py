@@ -60,7 +60,8 @@ def lift(
     run.write(output, splats)
     written = time.perf_counter()
     say_weight(run, cloud, output, splats)
-    discs, points = plural(len(splats), "disc"), plural(len(found.points), "point")
+    discs = plural(len(splats), "disc")
+    points = plural(len(found.points), "point")
     run.say(f"{output}: {discs} from {points} in {written - began:.1f} s")
     run.result(
         {

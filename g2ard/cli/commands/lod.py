@@ -169,7 +169,8 @@ def lod(
         raise typer.BadParameter("--environment needs --format sog")
     if environment and tiled:
         raise typer.BadParameter("--environment needs a scene that fits into memory")
-    views, colour = opt.with_images(views, images), background or BLACK
+    views = opt.with_images(views, images)
+    colour = background or BLACK
     meta = output / ("lod-meta.json" if kind == "sog" else "tileset.json")
     stopped = output.with_name(hidden_name(output.name, ".unfinished"))
     run.spare_inputs(meta)

@@ -104,7 +104,8 @@ def recover(
             run.console.table(title, list(COLUMNS), cells(kinds))
         for line in filter(None, (loss(kind, "the student is better there") for kind in kinds)):
             run.say(line)
-    gain, count = result.report.psnr, plural(len(job.student), "Gaussian")
+    gain = result.report.psnr
+    count = plural(len(job.student), "Gaussian")
     where = f"{opt.trained_on(split)} {job.views.cameras.size_text}"
     run.say(f"{output}: {count}, {where}: {gain.before:.2f} → {gain.after:.2f} dB")
     report = {**result.report.as_dict(), "preset": job.preset, "prior": job.measures}

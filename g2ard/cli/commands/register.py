@@ -199,9 +199,11 @@ def _told(summary: Summary) -> list[str]:
 def _said(accuracy: Accuracy, summary: Summary) -> str:
     if accuracy.median is None:
         return f"0 of {summary.true} poses to score"
-    scale, unit = (1.0, "units")
+    scale = 1.0
+    unit = "units"
     if summary.metres_per_unit is not None:
-        scale, unit = 100 * summary.metres_per_unit, "cm"
+        scale = 100 * summary.metres_per_unit
+        unit = "cm"
     shares = "".join(f", {r.share:.1%} ≤ {100 * r.metres:g} cm/{r.degrees:g}°" for r in accuracy.recalls)
     return (
         f"median {accuracy.median.position * scale:.3g} {unit} / {accuracy.median.rotation:.3g}° "

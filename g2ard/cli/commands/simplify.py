@@ -94,7 +94,8 @@ def simplify(
     outputs = None if dry_run else Outputs(output, budgets, run.claim_scene)
     if outputs is not None:
         outputs.check()
-    how, maps = tiling if is_tiled(source, tiling) else None, None
+    how = tiling if is_tiled(source, tiling) else None
+    maps = None
     if parents is not None and how is not None and source.kind == "points":
         raise typer.BadParameter(
             f"--parents: points become rows when tiles are written; run `g2ard ingest {scene} -o DIR`, "
@@ -122,7 +123,8 @@ def simplify(
             for budget in filter(lambda one: one.bytes is None, budgets):
                 budget.of(total, str(scene))
 
-    began, reports = time.perf_counter(), []
+    began = time.perf_counter()
+    reports = []
     inputs: dict[str, Any] = {
         "given": GivenViews(given, None, up, run.seed, rough=dry_run),
         "blind": no_views,

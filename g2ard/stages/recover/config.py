@@ -165,7 +165,9 @@ class Schedule(Settings):
         """Return the rates at the share `t` of the steps, from 0 at the first to 1 after the last."""
         fall = 1.0 if self.final_rate is None else 1 - (1 - self.final_rate) * t
         decay = self.appearance_decay[1 if final else 0] ** t
-        geometry, appearance, first = fall * multiplier, fall * decay * multiplier, self.rates
+        geometry = fall * multiplier
+        appearance = fall * decay * multiplier
+        first = self.rates
         return Rates(
             first.means * geometry,
             first.log_scales * geometry,

@@ -45,9 +45,11 @@ def typical_share(splats: Splats, cameras: Cameras) -> float:
     0.125
     """
     cameras = cameras.recentred(splats.offset)
-    largest, view_shares = splats.scales.max(1, initial=0.0).astype(np.float64), []
+    largest = splats.scales.max(1, initial=0.0).astype(np.float64)
+    view_shares = []
     for view in evenly_spaced(len(cameras), _MEASURED_VIEWS):
-        pose, K = cameras.viewmats[view], cameras.Ks[view]
+        pose = cameras.viewmats[view]
+        K = cameras.Ks[view]
         size = np.array([cameras.widths[view], cameras.heights[view]], np.float64)
         at = (splats.means @ pose[:3, :3].T + pose[:3, 3]) @ K.T
         front = at[:, 2] > 0
@@ -111,7 +113,8 @@ class FusedEngine:
 
     def __init__(self, objective: Objective) -> None:
         self._objective = objective
-        start, anchors = objective.start, objective.anchors
+        start = objective.start
+        anchors = objective.anchors
         units = radii(start) if objective.means_in_scales else None
         self._trainer = _core.Trainer(arrays_of(start), objective, units)
         self._skipped_before = 0

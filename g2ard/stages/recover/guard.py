@@ -69,7 +69,8 @@ class Guard:
     best_score: float = field(init=False)
 
     def __post_init__(self) -> None:
-        self.start, self.best_score = self.best, self.before
+        self.start = self.best
+        self.best_score = self.before
         if self.others is not None:
             self.validation.append({"step": 0, "psnr": self.others(self.start)})
 
@@ -88,7 +89,8 @@ class Guard:
         value = self.score(scene)
         self.scores.append((step, value))
         if value > self.best_score:
-            self.best, self.best_score = scene, value
+            self.best = scene
+            self.best_score = value
         if not value < self.before - _HOPELESS_LOSSES[self.looked - 1] and math.isfinite(value):
             if self.others is not None and share >= _VALIDATION_FROM:
                 self.validation.append({"step": step, "psnr": self.others(scene)})
@@ -146,7 +148,8 @@ class Guard:
             other = self._judged(blended(self.start, result, views / (views + k)))
             if not other[2] > mean + _LEAST_GAIN:
                 break
-            kept, (best, scores, mean) = k, other
+            kept = k
+            (best, scores, mean) = other
         if (harmful := self.harmful(best)) is not None:
             other = self._judged(blended(self.start, best, ~harmful))
             if other[2] > mean:
@@ -173,7 +176,9 @@ class Guard:
     ) -> tuple[Splats, float | None, dict[str, float]]:
         """Return the candidate whose worst kind of validation views gains most, its k and its scores."""
         assert self.others is not None
-        best, scores, most = self.start, self.validation[0]["psnr"], 0.0
+        best = self.start
+        scores = self.validation[0]["psnr"]
+        most = 0.0
         chosen: float | None = math.inf
         shares: list[tuple[float | None, NDArray[np.float64] | float]] = [
             *((k, views / (views + k)) for k in _PRIOR_VIEWS),
@@ -183,7 +188,10 @@ class Guard:
             part = blended(self.start, result, share)
             found = self.others(part)
             if self._gain(found) > most:
-                best, chosen, scores, most = part, k, found, self._gain(found)
+                best = part
+                chosen = k
+                scores = found
+                most = self._gain(found)
         return best, chosen, scores
 
     def choose_by_training(self, result: Splats) -> tuple[Splats, float, float]:

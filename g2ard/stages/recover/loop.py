@@ -124,7 +124,8 @@ class Loop:
 
     def _new_engine(self, start: Splats | None = None) -> Engine:
         """Create an engine that begins at `start`, by default at the student."""
-        config, student = self.config, self.student if start is None else start
+        config = self.config
+        student = self.student if start is None else start
         objective = Objective(
             settings=settings_for(self.anchors.means, antialiased=student.antialiased),
             background=config.background,
@@ -149,7 +150,8 @@ class Loop:
         The time of the trials counts. `start` is the PSNR before recovery. It alone decides for short
         horizons, and for renders that are not nearly fitted.
         """
-        schedule, limit = self.config.schedule, self.config.recovery_time
+        schedule = self.config.schedule
+        limit = self.config.recovery_time
         rmse = 10 ** (-start / 20)
         typical = typical_share(self.student, self.targets.cameras)
         self.reach = reach_for(rmse, typical) if schedule.reach is None else schedule.reach
@@ -206,7 +208,8 @@ class Loop:
         rates = self.schedule.at(share, final=self.config.final, multiplier=multiplier, reach=self.reach)
         view = self._view(step)
         if self.exposures is None:
-            target, mask = self.targets[view], mask_of(self.targets, view)
+            target = self.targets[view]
+            mask = mask_of(self.targets, view)
         else:
             target, mask = unexposed(self.targets, view, self.exposures[view], self.config.background)
         fixed = self.exposures is None
@@ -237,16 +240,20 @@ class Loop:
                 return self.engine.splats(), seen
             except DeviceError:  # `system.devices.notes` has the reason
                 del self.engine
-                seconds, resumed = self.seconds, self.resumed
+                seconds = self.seconds
+                resumed = self.resumed
                 if checkpoint is not None and checkpoint.exists():
                     self._resume(checkpoint)
                 else:
                     self._restore(copy.deepcopy(start), {"losses": np.zeros(0)})
-                self.seconds, self.resumed = seconds, resumed
+                self.seconds = seconds
+                self.resumed = resumed
 
     def _run(self, checkpoint: Path | None, progress: Progress, stage: str, watch: Watch | None) -> None:
         """Take the remaining steps."""
-        earlier, began, saved = self.seconds, time.monotonic(), time.monotonic()
+        earlier = self.seconds
+        began = time.monotonic()
+        saved = time.monotonic()
         with checkpoints.deferred_interrupt() as interrupted:
             while self._used_share() < 1 and self.guard.stopped is None:
                 self._step()
@@ -273,7 +280,8 @@ class Loop:
         return self.done / self.config.horizon
 
     def _step(self) -> None:
-        config, step = self.config, self.done
+        config = self.config
+        step = self.done
         regularize = config.regularizers.active and (step + 1) % config.regularizers.period == 0
         began = time.monotonic()
         loss = self._learn(self.engine, step, self._used_share(), self.multiplier, regularize=regularize)
@@ -325,10 +333,8 @@ class Loop:
         """Steps and cost of the regularisers."""
         (plain, plain_seconds), (regularized, regularized_seconds) = self.tally
         extra = regularized_seconds - regularized * plain_seconds / plain if plain and regularized else 0.0
-        share, weights = (
-            max(0.0, extra) / max(plain_seconds + regularized_seconds, 1e-9),
-            self.config.regularizers,
-        )
+        share = max(0.0, extra) / max(plain_seconds + regularized_seconds, 1e-9)
+        weights = self.config.regularizers
         return Regularized(int(regularized), share, weights.period if weights.active else 0)
 
     def _tell(self, progress: Progress, stage: str) -> None:

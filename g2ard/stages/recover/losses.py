@@ -41,7 +41,9 @@ def extents(
     to_screen = focal[:, None] * (pose[:2, :3] - ray[..., None] * pose[2, :3]) / depth[..., None]
     axes = to_screen @ rotations(quats) * log_scales.exp()[:, None]  # (N, 2, 3)
     x, y = axes.unbind(1)
-    xx, xy, yy = (x * x).sum(1), (x * y).sum(1), (y * y).sum(1)
+    xx = (x * x).sum(1)
+    xy = (x * y).sum(1)
+    yy = (y * y).sum(1)
     largest = 0.5 * (xx + yy) + ((0.5 * (xx - yy)) ** 2 + xy**2).sqrt()
     return largest * seen, (axes**2).sum(1) * seen[:, None]
 

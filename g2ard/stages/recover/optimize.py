@@ -114,7 +114,9 @@ def recover(
     guard = Guard(probe.all_of, student, before, others, harmful, config.schedule.guarded)
     validation_key = None if validation is None else fingerprint_of(validation)
     end = result = student
-    after, blend, seen = before, 1.0, None
+    after = before
+    blend = 1.0
+    seen = None
     loop = Loop(
         student, targets, config, view_weights, anchors, probe, guard, validation_key, frozen, time_left
     )
@@ -130,7 +132,8 @@ def recover(
     if result is end and seen is not None:
         result, prior_views = guard.choose_by_validation(end, seen, loop.done)
         if result is not end:
-            after, blend = probe.all_of(result), float(result is not student)
+            after = probe.all_of(result)
+            blend = float(result is not student)
     validated = None
     if validation is not None:
         shrunk = None if prior_views is None else finite(prior_views)

@@ -41,7 +41,9 @@ class Probe:
     ) -> None:
         targets = with_pixels(targets)
         self._views = evenly_spaced(len(targets.cameras), _SCORED_VIEWS)
-        self._targets, self._background, self._most = targets, background, most
+        self._targets = targets
+        self._background = background
+        self._most = most
         self._next = 0.0
         self._latest = (float("nan"), 0)
         self._scored: tuple[Splats, float] | None = None
@@ -54,7 +56,8 @@ class Probe:
 
     def fit_exposures(self) -> None:
         """Score after a fit of exposures from now on."""
-        self._targets, self._scored = Exposed(self._targets), None
+        self._targets = Exposed(self._targets)
+        self._scored = None
 
     def all_of(self, splats: Splats) -> float:
         """Return the mean PSNR over the views; that of the latest scene is known."""
@@ -108,7 +111,8 @@ def harmful_changes(
     views that lost, and over all of them together with as many training views: what few validation views say
     about a Gaussian is mostly chance.
     """
-    held, views = _Comparison(start, result, validation, background), range(len(validation.cameras))
+    held = _Comparison(start, result, validation, background)
+    views = range(len(validation.cameras))
     losing = [lost > _TOLERATED_LOSS for lost in in_threads(held.lost, views)]
     if not any(losing):
         return None
@@ -138,7 +142,8 @@ class _Comparison:
         self._grey = (means, quats, scales, logits, *colours)
 
     def _errors(self, view: int) -> list[NDArray[np.float32]]:
-        camera, target = self._targets.cameras[view], self._targets[view]
+        camera = self._targets.cameras[view]
+        target = self._targets[view]
         mask = mask_of(self._targets, view)
         errors = []
         for renderer in self._renderers:

@@ -150,7 +150,8 @@ def outcome(report: RecoverReport) -> str | None:
         why = "every step made the training views worse"
         looks = report.validation.looks if report.validation else ()
         if len(looks) > 2 and looks[-1].psnr == looks[0].psnr:
-            first, end = looks[0].psnr, looks[-2].psnr
+            first = looks[0].psnr
+            end = looks[-2].psnr
             kind = min(first, key=lambda kind: end[kind] - first[kind])
             name = "" if kind == USUAL else f" of kind {kind}"
             change = f"{first[kind]:.2f} → {end[kind]:.2f} dB"

@@ -58,7 +58,9 @@ class SelectiveAdam:
 
     def _arrays(self, name: str, rate: float, share: Tensor | None) -> tuple[Any, ...]:
         """Return a parameter, its moments, gradient, rate and share for the kernel, without copies."""
-        p, m, v = self._parameters[name], self.moments[f"m.{name}"], self.moments[f"v.{name}"]
+        p = self._parameters[name]
+        m = self.moments[f"m.{name}"]
+        v = self.moments[f"v.{name}"]
         assert p.grad is not None
         held = (t.numpy() for t in (p.detach(), m, v, p.grad.contiguous()))
         return *held, rate, None if share is None else share.contiguous().numpy()
@@ -126,7 +128,8 @@ class TorchEngine:
         if self._objective.relative:
             total = total * (TYPICAL_LOSS / max(float(loss.detach()), LEAST_LOSS))
         if regularize:
-            anchors, weights = self._objective.anchors, self._objective.regularizers
+            anchors = self._objective.anchors
+            weights = self._objective.regularizers
             total = total + regularization(means, p["quats"], p["log_scales"], anchors, weights)
         for parameter in p.values():
             parameter.grad = None
@@ -138,7 +141,9 @@ class TorchEngine:
         """Return factors on each rate, per row or value, from sizes in this view."""
         if math.isinf(rates.reach) and not rates.finest:
             return {}
-        p, near, cameras = self._parameters, self._settings.near_of(view), self._objective.cameras
+        p = self._parameters
+        near = self._settings.near_of(view)
+        cameras = self._objective.cameras
         largest, axes = extents(means, p["quats"], p["log_scales"], cameras, view, near)
         pixels = rates.reach * float(max(cameras.widths[view], cameras.heights[view]))
         whole, own = (share_of_rate(sizes, pixels, rates.finest) for sizes in (largest, axes))
@@ -146,7 +151,8 @@ class TorchEngine:
 
     def _render(self, means: Tensor, view: int) -> Tensor:
         """Render one view (H, W, 3), differentiably."""
-        objective, parameters = self._objective, {**self._parameters, "means": means}
+        objective = self._objective
+        parameters = {**self._parameters, "means": means}
         return rasterize(
             **parameters,
             cameras=objective.cameras,

@@ -39,7 +39,8 @@ class Trials:
     def __init__(self, run: Callable[[float, float], float], start: float, limit: float | None) -> None:
         self.scores: dict[float, float] = {}
         self.start = start
-        self._run, self._limit = run, math.inf if limit is None else limit
+        self._run = run
+        self._limit = math.inf if limit is None else limit
         self._began = time.monotonic()
 
     def search(self, guess: float) -> float:

@@ -239,7 +239,10 @@ def _align_level(
         pixels = int((photo.mask & shot.mask).sum())
         return with_prior(normal, pixels, float(np.log(there.K[0, 0] / camera.K[0, 0])), prior, config)
 
-    pose, zoom, light, taken = state.viewmat, state.zoom, (state.gain, state.bias), state.steps + 1
+    pose = state.viewmat
+    zoom = state.zoom
+    light = (state.gain, state.bias)
+    taken = state.steps + 1
     view = seen(pose, zoom)
     if view is None:
         return None
@@ -253,7 +256,8 @@ def _align_level(
         for _ in range(_STEP_HALVINGS + 1):
             if step is None:
                 break
-            trial, focal = moved(pose, step[:6]), zoom * float(np.exp(np.clip(step[6], -_WIDEST, _WIDEST)))
+            trial = moved(pose, step[:6])
+            focal = zoom * float(np.exp(np.clip(step[6], -_WIDEST, _WIDEST)))
             there = seen(trial, focal)
             taken += 1
             if there is not None:
@@ -266,7 +270,11 @@ def _align_level(
         if not better or step is None or there is None:
             break
         still = moves(view[1], view[0].K, step[:7]) < enough
-        pose, zoom, view, normal, light = trial, focal, there, after, lit
+        pose = trial
+        zoom = focal
+        view = there
+        normal = after
+        light = lit
         if still:
             break
     final = equations(view, light)
@@ -289,7 +297,8 @@ def _align_level(
 def with_prior(normal: Normal, pixels: int, zoom: float, sigma: float, config: RegisterConfig) -> Normal:
     """Add the prior of the logarithm of the focal length, `zoom` ~ N(0, `sigma`²), to equations and cost."""
     weight = normal.scale**2 * config.correlated / sigma**2
-    matrix, right = normal.matrix.copy(), normal.right.copy()
+    matrix = normal.matrix.copy()
+    right = normal.right.copy()
     matrix[6, 6] += weight
     right[6] -= weight * zoom
     penalty = 3 * config.correlated * (zoom / sigma / _TUKEY) ** 2 / pixels
@@ -299,7 +308,8 @@ def with_prior(normal: Normal, pixels: int, zoom: float, sigma: float, config: R
 def _light(photo: Level, shot: Shot) -> tuple[float, float]:
     """Return the gain and bias that match the render's mean and spread to the photo's, without alignment."""
     mask = photo.mask & shot.mask
-    a, b = shot.grey[mask], photo.grey[mask]
+    a = shot.grey[mask]
+    b = photo.grey[mask]
     spread = float(a.std())
     gain = float(np.clip(b.std() / spread, 0.1, 10)) if spread > 1e-6 else 1.0
     return gain, float(b.mean() - gain * a.mean())

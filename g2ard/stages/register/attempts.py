@@ -45,7 +45,10 @@ class PoolRenders:
     def __init__(
         self, renderer: Renderer, pool: Cameras, config: RegisterConfig, progress: Progress = silent
     ) -> None:
-        self._renderer, self.pool, self._config, self._progress = renderer, pool, config, progress
+        self._renderer = renderer
+        self.pool = pool
+        self._config = config
+        self._progress = progress
         self._kept: dict[bytes, list[Float]] = {}
 
     def ranked(self, camera: Camera, grey: Float) -> tuple[list[tuple[int, Float]], int]:
@@ -175,7 +178,9 @@ class Search:
     """
 
     def __init__(self, renderer: Renderer, config: RegisterConfig, match: Matcher | None) -> None:
-        self.renderer, self.config, self.match = renderer, config, match
+        self.renderer = renderer
+        self.config = config
+        self.match = match
         self.renders = 0
         self._sift = match if isinstance(match, Sift) else sift_or_none(config.ratio, config.features)
 
@@ -268,7 +273,8 @@ class Search:
         information: ξ = (Λ_f + Λ_p)⁻¹ (Λ_p ξ_p − Λ_0 ξ_0), with ξ_p the motion from the first to the second,
         Λ_0 and ξ_0 the prior of the focal length, which Λ_p has too.
         """
-        refine, focal_sigma = self.config.refine, solved.focal_sigma
+        refine = self.config.refine
+        focal_sigma = solved.focal_sigma
         near = self._aligned(solved.viewmat, photo.pyramid[-_REFINING_LEVELS:], solved.zoom, focal_sigma)
         prior = np.zeros((7, 7))
         prior[6, 6] = focal_sigma**-2

@@ -54,8 +54,10 @@ def zncc(a: Float, b: Float, mask: NDArray[np.bool_]) -> float:
     """
     if not mask.any():
         return 0.0
-    x, y = a[mask], b[mask]
-    x, y = x - x.mean(), y - y.mean()
+    x = a[mask]
+    y = b[mask]
+    x = x - x.mean()
+    y = y - y.mean()
     scale = np.sqrt((x * x).sum() * (y * y).sum())
     return float((x * y).sum() / scale) if scale > 1e-12 else 0.0
 
@@ -74,7 +76,8 @@ def shift_between(a: Float, b: Float) -> tuple[int, int, float]:
         return 0, 0, 0.0
     shape = (2 * height, 2 * width)
     product = np.fft.irfft2(np.fft.rfft2(b, shape) * np.conj(np.fft.rfft2(a, shape)), shape)
-    down, right = np.arange(-(height // 2), height // 2 + 1), np.arange(-(width // 2), width // 2 + 1)
+    down = np.arange(-(height // 2), height // 2 + 1)
+    right = np.arange(-(width // 2), width // 2 + 1)
     near = product[np.ix_(down, right)]
     at = np.unravel_index(int(np.argmax(near)), near.shape)
     return int(right[at[1]]), int(down[at[0]]), float(near[at] / scale)
@@ -89,5 +92,6 @@ def local_zncc(a: Float, b: Float, mask: NDArray[np.bool_], side: int) -> float:
     """
     if min(a.shape) < side:
         return zncc(a, b, mask)
-    a, b = np.ascontiguousarray(a), np.ascontiguousarray(b)
+    a = np.ascontiguousarray(a)
+    b = np.ascontiguousarray(b)
     return _core.local_zncc(a, b, np.ascontiguousarray(mask), side)

@@ -152,7 +152,8 @@ class Sift:
 
         pycolmap.logging.minloglevel = 2  # silence the log line per extractor
         options = pycolmap.FeatureExtractionOptions()
-        options.use_gpu, options.num_threads = False, 1
+        options.use_gpu = False
+        options.num_threads = 1
         options.sift.max_num_features = most
         self._extractors = []
         for options.sift.first_octave in (-1, 0):
@@ -192,7 +193,8 @@ def mutual(
     if not len(a) or not len(b):
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
     squares = (a * a).sum(1)[:, None] + (b * b).sum(1)[None, :] - 2 * (a @ b.T)
-    nearest, back = squares.argmin(1), squares.argmin(0)
+    nearest = squares.argmin(1)
+    back = squares.argmin(0)
     rows = np.arange(len(a))
     least = squares[rows, nearest].copy()
     squares[rows, nearest] = np.inf

@@ -73,7 +73,11 @@ def register(
     renderer = Renderer(scene, background=background)
     renders = None if pool is None else PoolRenders(renderer, pool, config, progress)
     search = Search(renderer, config, matcher_named(config.matcher, config.ratio, config.features))
-    rows, kept, poses, zooms, matches = [], [], [], [], {}
+    rows = []
+    kept = []
+    poses = []
+    zooms = []
+    matches = {}
     for i, name in enumerate(photos.names):
         progress("register", i, len(photos))
         began = time.perf_counter()
@@ -208,7 +212,8 @@ def _reported(
     name: str, best: Candidate, config: RegisterConfig, renders: int, focal: float, alike: list[Float]
 ) -> PhotoReport:
     estimate = best.found
-    sigma, covariance = None, None
+    sigma = None
+    covariance = None
     prior = best.solved.focal_sigma if best.solved else config.focal_sigma
     if estimate.covariance is not None:
         motions = [motion_between(estimate.viewmat, other) for other in alike]
@@ -221,7 +226,8 @@ def _reported(
     status, reason = _acceptance(best.zncc, sigma, estimate.depth, config)
     if alike and status != "refused":
         away = min(pose_error(estimate.viewmat, other)[0] for other in alike)
-        status, reason = "uncertain", f"places look alike: a pose {away:.2g} units away fits as well"
+        status = "uncertain"
+        reason = f"places look alike: a pose {away:.2g} units away fits as well"
     names = ("matches", "inliers", "spread", "reprojection", "passes") if best.solved else ()
     of_features: dict[str, Any] = {name: getattr(best.solved, name) for name in names}
     return PhotoReport(

@@ -24,7 +24,8 @@ def moved(viewmat: Float, xi: ArrayLike) -> Float:
     The translation of exp(ξ) is V·v with V = I + (1 − cos θ)/θ² [ω]ₓ + (θ − sin θ)/θ³ [ω]ₓ². The rotation is
     re-orthogonalised, so that rounding does not accumulate.
     """
-    v, omega = np.asarray(xi, np.float64)[:3], np.asarray(xi, np.float64)[3:]
+    v = np.asarray(xi, np.float64)[:3]
+    omega = np.asarray(xi, np.float64)[3:]
     cross, first, second = _rodrigues(omega)
     angle2 = float(omega @ omega)
     third = (1 - first) / angle2 if angle2 > 1e-8 else 1 / 6

@@ -93,7 +93,8 @@ def repeated_poses(renderer: Renderer, camera: Camera, sift: Sift, config: Regis
     places, descriptors = sift.features(np.clip(out.image, 0, 1))
     points, known = lifted(out, camera, places, config)
     step = 1 + int(known.sum()) // _MOST_FEATURES
-    places, points = places[known][::step], points[known][::step]
+    places = places[known][::step]
+    points = points[known][::step]
     descriptors = descriptors[known][::step] / np.float32(512)
     least = max(_LEAST_SUPPORT[0], int(_LEAST_SUPPORT[1] * len(places)))
     if len(places) < least:
@@ -103,7 +104,8 @@ def repeated_poses(renderer: Renderer, camera: Camera, sift: Sift, config: Regis
     apart = np.hypot(*(np.subtract.outer(axis, axis) for axis in places.T))
     i, j = np.nonzero((squares < _LIKE) & (apart > _LEAST_SHIFT * side))
     fewer = slice(None, None, 1 + len(i) // _MOST_PAIRS)
-    i, j = i[fewer], j[fewer]
+    i = i[fewer]
+    j = j[fewer]
     poses = []
     depth = float(np.median(points @ camera.viewmat[2, :3] + camera.viewmat[2, 3]))
     offsets = points[j] - points[i]
@@ -153,7 +155,8 @@ class _Resemblance:
         self._size = width, height = round(camera.width * share), round(camera.height * share)
         planes = np.dstack([grey_of(np.clip(out.image, 0, 1)), out.alpha >= config.min_alpha])
         small = resized(planes.astype(np.float32), (width, height)).astype(np.float64)
-        self._grey, self._mask = band_passed(small[..., 0]), small[..., 1] > 0.999
+        self._grey = band_passed(small[..., 0])
+        self._mask = small[..., 1] > 0.999
         self._scale = np.array([width / camera.width, height / camera.height])
         self._camera = camera
         v, u = np.nonzero(self._mask)
@@ -162,14 +165,16 @@ class _Resemblance:
         z = out.depth[row, column].astype(np.float64)
         K = camera.K
         rays = np.stack([(at[:, 0] - K[0, 2]) / K[0, 0], (at[:, 1] - K[1, 2]) / K[1, 1], np.ones(len(at))], 1)
-        self._seen, self._here = rays * z[:, None], self._grey[v, u]
+        self._seen = rays * z[:, None]
+        self._here = self._grey[v, u]
 
     def of(self, pose: Float) -> float:
         """Return the ZNCC times the square root of the share of pixels compared; 0 where it is too low."""
         motion = pose @ np.linalg.inv(self._camera.viewmat)
         X = self._seen @ motion[:3, :3].T + motion[:3, 3]
         ahead = X[:, 2] > 1e-3 * np.abs(self._seen[:, 2])
-        K, depth = self._camera.K, np.where(ahead, X[:, 2], 1)
+        K = self._camera.K
+        depth = np.where(ahead, X[:, 2], 1)
         uv = X[:, :2] / depth[:, None] * [K[0, 0], K[1, 1]] + K[:2, 2]
         column, row = np.floor(np.clip(uv * self._scale, -1, 1e6)).astype(int).T
         inside = ahead & (column >= 0) & (row >= 0) & (column < self._size[0]) & (row < self._size[1])
@@ -197,7 +202,8 @@ def preference(photo: Float, mask: NDArray[np.bool_], a: Look, b: Look, config: 
         agree = both
     if not agree.any():
         return 0.0
-    mean, seen = ((a.image + b.image) / 2)[agree], photo[agree]
+    mean = ((a.image + b.image) / 2)[agree]
+    seen = photo[agree]
     spread = np.maximum(((mean - mean.mean(0)) ** 2).mean(0), 1e-6)
     gain = np.clip(((mean - mean.mean(0)) * (seen - seen.mean(0))).mean(0) / spread, 0.1, 10)
     bias = seen.mean(0) - gain * mean.mean(0)

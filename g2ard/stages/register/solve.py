@@ -87,15 +87,19 @@ def solve(
         out = renderer.render(there, median=True)
         uv, seen = match(photo, np.clip(out.image, 0, 1))
         counts = _at(mask, uv)
-        uv, seen = uv[counts], seen[counts]
+        uv = uv[counts]
+        seen = seen[counts]
         points, known = lifted(out, there, seen, config)
         after = solve_pnp(there, uv[known], points[known], config)
         if after is None:
             break
         T, inlying = after
-        of, at, X = uv[known][inlying], seen[known][inlying], points[known][inlying]
+        of = uv[known][inlying]
+        at = seen[known][inlying]
+        X = points[known][inlying]
         found, prior, data, alone = with_focal(zoomed(there, 1.0, T), camera.K[0, 0], of, X, config)
-        T, K = found.viewmat, found.K
+        T = found.viewmat
+        K = found.K
         shift = _projected(T, K, X) - _projected(there.viewmat, there.K, X)
         cells = np.floor(4 * of / [camera.width, camera.height]).clip(0, 3) @ [1, 4]
         distance = np.linalg.norm(_projected(T, K, X) - of, axis=1)
@@ -139,16 +143,20 @@ def lifted(
     x, y = (uv - 0.5).T
     left = np.clip(np.floor(x).astype(int), 0, max(width - 2, 0))
     top = np.clip(np.floor(y).astype(int), 0, max(height - 2, 0))
-    right, down = np.minimum(left + 1, width - 1), np.minimum(top + 1, height - 1)
-    a, b = np.clip(x - left, 0, 1), np.clip(y - top, 0, 1)
+    right = np.minimum(left + 1, width - 1)
+    down = np.minimum(top + 1, height - 1)
+    a = np.clip(x - left, 0, 1)
+    b = np.clip(y - top, 0, 1)
     share = np.stack([(1 - a) * (1 - b), a * (1 - b), (1 - a) * b, a * b])
     cells = (top, left), (top, right), (down, left), (down, right)
     depths = np.stack([out.median[cell].astype(np.float64) for cell in cells])
     alpha = np.stack([out.alpha[cell].astype(np.float64) for cell in cells]).min(0)
-    nearest, z = depths.min(0), (share * depths).sum(0)
+    nearest = depths.min(0)
+    z = (share * depths).sum(0)
     known = (nearest > 0) & (alpha >= config.min_alpha)
     known &= depths.max(0) - nearest <= config.max_edge * nearest
-    K, T = camera.K, camera.viewmat
+    K = camera.K
+    T = camera.viewmat
     seen = np.stack([(uv[:, 0] - K[0, 2]) / K[0, 0] * z, (uv[:, 1] - K[1, 2]) / K[1, 1] * z, z], 1)
     return np.einsum("mi,ij->mj", seen - T[:3, 3], T[:3, :3], optimize=False), known
 
@@ -167,7 +175,8 @@ def solve_pnp(
     )
     options = pycolmap.AbsolutePoseEstimationOptions()
     options.ransac.max_error = config.max_reprojection
-    options.ransac.random_seed, options.ransac.num_threads = 0, 1
+    options.ransac.random_seed = 0
+    options.ransac.num_threads = 1
     refinement = pycolmap.AbsolutePoseRefinementOptions()
     refinement.gradient_tolerance = 1e-8
     middle = np.median(points, 0)
@@ -195,7 +204,8 @@ def with_focal(
         here = camera
         for _ in range(_FOCAL_STEPS):
             data, right = information(here.viewmat, here.K, uv, points)
-            data, right = data / config.alike, right / config.alike
+            data = data / config.alike
+            right = right / config.alike
             alone = focal_alone(data, right, here.K[0, 0] / given)
             both = data.copy()
             both[6, 6] += 1 / prior**2
@@ -229,7 +239,9 @@ def information(T: Float, K: Float, uv: Float, points: Float) -> tuple[Float, Fl
     absolute deviation of the residuals.
     """
     X = points @ T[:3, :3].T + T[:3, 3]
-    x, y, depth = X[:, 0] / X[:, 2], X[:, 1] / X[:, 2], X[:, 2]
+    x = X[:, 0] / X[:, 2]
+    y = X[:, 1] / X[:, 2]
+    depth = X[:, 2]
     none = np.zeros(len(X))
     right = np.stack([1 / depth, none, -x / depth, -x * y, 1 + x * x, -y, x]) * K[0, 0]
     down = np.stack([none, 1 / depth, -y / depth, -1 - y * y, x * y, x, y]) * K[1, 1]

@@ -96,9 +96,11 @@ def select(
     seconds: dict[str, float] = {}
     progress("select", 0, 0)
     candidates = poses.measure_candidates(splats, cameras, progress)
-    alike, usable = candidates.alike, candidates.usable
+    alike = candidates.alike
+    usable = candidates.usable
     seconds["poses"] = time.perf_counter() - began
-    evaluations, refused = 0, ~usable
+    evaluations = 0
+    refused = ~usable
     if policy == "directional":
         rows = np.flatnonzero(usable)
         order, gains, evaluations = greedy(splats, cameras.take(rows), options, progress, seconds)

@@ -86,7 +86,8 @@ def _light(
     """Return (C, R) min(share·A, 64)/16 for some rows."""
     local, here = centred(scene, cameras.resized(_RENDER_SIDE))
     settings = settings_for(local.means, None, antialiased=local.antialiased)
-    arrays, light = arrays_of(local), np.zeros((len(cameras), len(rows)), np.float32)
+    arrays = arrays_of(local)
+    light = np.zeros((len(cameras), len(rows)), np.float32)
     for first in range(0, len(cameras), _BATCH):
         batch = range(first, min(first + _BATCH, len(cameras)))
         views = [view_of(here, i, settings) for i in batch]

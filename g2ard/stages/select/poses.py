@@ -72,17 +72,21 @@ def outlooks(cells: Surface, cameras: Cameras) -> tuple[Float, Float]:
         that are visible there, by occlusion in a grid of 48 × 36.
     """
     local = cameras.recentred(cells.origin)
-    depths, shares = np.zeros(len(local)), np.zeros(len(local))
+    depths = np.zeros(len(local))
+    shares = np.zeros(len(local))
     columns, rows = _DEPTH_GRID
     for i in range(len(local)):
         x, y, z = local.viewmats[i, :3, :3] @ cells.centers.T + local.viewmats[i, :3, 3:]
         ahead = z > 0
         z = np.where(ahead, z, 1.0)
         K = local.Ks[i]
-        u, v = K[0, 0] * x / z + K[0, 2], K[1, 1] * y / z + K[1, 2]
+        u = K[0, 0] * x / z + K[0, 2]
+        v = K[1, 1] * y / z + K[1, 2]
         inside = ahead & (u >= 0) & (u < local.widths[i]) & (v >= 0) & (v < local.heights[i])
         if inside.any():
-            u, v, z = u[inside], v[inside], z[inside]
+            u = u[inside]
+            v = v[inside]
+            z = z[inside]
             row = (v * rows / local.heights[i]).astype(int)
             column = (u * columns / local.widths[i]).astype(int)
             place = row * columns + column
@@ -150,8 +154,10 @@ def facility_location(alike: Float, pose_weights: Float, usable: NDArray[np.bool
         usable: (C,) mask of views that may be chosen.
         shares: (C,) from `outlooks`.
     """
-    away, worth = bandwidths_apart(alike), shares**_SCENE_SHARE_EXPONENT
-    best, left = np.zeros(len(alike)), usable.copy()
+    away = bandwidths_apart(alike)
+    worth = shares**_SCENE_SHARE_EXPONENT
+    best = np.zeros(len(alike))
+    left = usable.copy()
     nearest = np.where(usable, np.inf, -np.inf)
     order: list[int] = []
     for _ in range(int(usable.sum())):
@@ -176,7 +182,8 @@ def bandwidths_apart(alike: Float) -> Float:
 
 def gains_of(order: Order, alike: Float, pose_weights: Float) -> Float:
     """Return the gain of each view of an order in facility location, Σ_u w_u max_{v∈S} alike_uv."""
-    best, gains = np.zeros(len(alike)), []
+    best = np.zeros(len(alike))
+    gains = []
     for view in order:
         gains.append(float(pose_weights @ np.maximum(alike[:, view] - best, 0.0)))
         best = np.maximum(best, alike[:, view])

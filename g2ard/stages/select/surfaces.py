@@ -124,7 +124,8 @@ def core_scene(splats: Splats) -> tuple[tuple[Any, ...], Float]:
 
 def core_views(cameras: Cameras, origin: Float, scene: tuple[Any, ...]) -> list[View]:
     """Convert cameras to the form that `_core` takes, relative to the origin of `core_scene`."""
-    settings, local = settings_for(scene[0]), cameras.recentred(origin)
+    settings = settings_for(scene[0])
+    local = cameras.recentred(origin)
     return [view_of(local, i, settings) for i in range(len(local))]
 
 

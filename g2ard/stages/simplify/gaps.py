@@ -53,7 +53,8 @@ def light_lost(
 
     through = opaque = 0.0
     for misses, stops in in_threads(lost, list(views)):
-        through, opaque = through + misses, opaque + stops
+        through = through + misses
+        opaque = opaque + stops
     return through, opaque
 
 

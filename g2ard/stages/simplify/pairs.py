@@ -97,9 +97,11 @@ def merge_and_fit(
     members. `default` also fits colours if Gaussians join many members, and `source` has `views`."""
     visibility = rows_of(source(scene), len(scene), slice(None))
     out = merge(scene, budget, visibility, protected, config, progress)
-    merged, parents = splats_of(scene, out), out["parents"]
+    merged = splats_of(scene, out)
+    parents = out["parents"]
     order = scene.core.order  # sums in this order do not depend on the order of the scene's rows
-    row, weight = parents[order], visibility.weight[order]
+    row = parents[order]
+    weight = visibility.weight[order]
     kept = row >= 0
     members = np.bincount(row[kept], minlength=len(merged))
     wanted = np.bincount(row[kept], weight[kept], len(merged))

@@ -210,7 +210,8 @@ def simplify(
         require("protected", given, fits, f"bool of shape ({len(splats)},)")
         protected = np.ascontiguousarray(protected[finite])
     if not (scene.opacities >= (config.resolved().min_opacity or 0.0)).any():
-        scene, config = with_some_opacity(scene), replace(config, min_opacity=0.0)
+        scene = with_some_opacity(scene)
+        config = replace(config, min_opacity=0.0)
     if not isinstance(config, Pairs):
         out = _core.simplify_paper(
             scene.core,
