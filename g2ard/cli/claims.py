@@ -135,7 +135,7 @@ class Claims:
     @cached_property
     def _beside(self) -> set[Path]:
         """Splits, points and exposures that are found beside views and photos."""
-        from g2ard.io.images import exposure_file
+        from g2ard.io.exposures import exposure_file
         from g2ard.io.splits import split_files
         from g2ard.jobs.photo_points import sparse_file
 

@@ -266,8 +266,8 @@ def background_of(run: Run, given: Triple | None, *scenes: Path | None) -> Tripl
 
     None means the default.
     """
+    from g2ard.config.choices import colour_text
     from g2ard.io.detect import run_background
-    from g2ard.io.images import colour_text
 
     if given is not None:
         return given

@@ -99,3 +99,14 @@ PlyLayout = Literal["inria"]
 def is_made(views: object) -> bool:
     """Return whether views are to be generated rather than given."""
     return isinstance(views, str) and views == "made"
+
+
+def colour_text(colour: Colour) -> str:
+    """Return a colour as `--background` takes it.
+
+    >>> colour_text((1, 1, 1)), colour_text((0.5, 0.25, 1))
+    ('white', '0.5,0.25,1')
+    """
+    named = {(0.0, 0.0, 0.0): "black", (1.0, 1.0, 1.0): "white"}
+    red, green, blue = (round(float(value), 3) for value in colour)
+    return named.get((red, green, blue), f"{red:g},{green:g},{blue:g}")

@@ -8,9 +8,10 @@ import numpy as np
 from g2ard.errors import InputError, damaged
 from g2ard.io.colmap import parsing
 from g2ard.io.finding import Finder
+from g2ard.io.frames import Frame, Lens, Listed, posed
 from g2ard.io.jsonfile import Place
 from g2ard.io.paths import read_text
-from g2ard.io.photos import Frame, Lens, Listed, photo_size, posed
+from g2ard.io.photo_headers import photo_size
 from g2ard.io.types import Float, ViewFiles
 
 _PHOTO_SIZE = (1920, 1080)  # size of the original photos, for which focal lengths are given

@@ -15,9 +15,9 @@ import numpy as np
 
 from g2ard.errors import InputError, damaged
 from g2ard.io.finding import Finder, files_in
+from g2ard.io.frames import Frame, Lens, Listed, posed
 from g2ard.io.jsonfile import Place
 from g2ard.io.paths import about, read_text
-from g2ard.io.photos import Frame, Lens, Listed, posed
 from g2ard.io.transforms import intrinsics_of
 from g2ard.io.types import Float, ViewFiles
 from g2ard.progress import plural

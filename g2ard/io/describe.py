@@ -7,10 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
+from g2ard.config.choices import colour_text
 from g2ard.io import Source, read_view_set
 from g2ard.io.detect import run_scene
-from g2ard.io.images import colour_text, photo_traits
 from g2ard.io.jsonfile import Json
+from g2ard.io.photos import photo_traits
 from g2ard.io.sog import chunks_of
 from g2ard.io.splits import splits_of
 from g2ard.io.types import Note, Points, Values, ViewFiles, ViewSet

@@ -383,7 +383,7 @@ _NO_FOLDER = "is not a supported folder"
 def _unsupported(path: Path) -> str:
     """Say what a folder holds instead of one thing that can be read, and what to give."""
     from g2ard.io.colmap import models_below
-    from g2ard.io.photos import unreadable
+    from g2ard.io.photo_headers import unreadable
 
     held: dict[Kind, list[str]] = {"splats": [], "points": [], "views": []}
     files = (

@@ -13,9 +13,9 @@ import numpy as np
 
 from g2ard.errors import G2ardError, InputError, missing
 from g2ard.io.atomic import atomic_output
+from g2ard.io.frames import Frame, Lens, Listed, inverse, posed
 from g2ard.io.judge import full_scales
 from g2ard.io.paths import check_unpacked, file_identity, user_cache
-from g2ard.io.photos import Frame, Lens, Listed, inverse, posed
 from g2ard.io.stream import JoinedClouds, MarkedPoints, Names, PointStream, telling
 from g2ard.io.transforms import FLIP
 from g2ard.io.types import Float, Note, Notes, ViewFiles

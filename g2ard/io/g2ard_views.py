@@ -11,9 +11,9 @@ from numpy.typing import ArrayLike
 
 from g2ard.errors import InputError
 from g2ard.io.finding import Finder
+from g2ard.io.frames import Frame, Lens, Listed, rigid
 from g2ard.io.jsonfile import Json, Matrix, Number, Place, Pose, Weight, Whole, checked, read_own
 from g2ard.io.paths import beside
-from g2ard.io.photos import Frame, Lens, Listed, rigid
 from g2ard.io.types import Float, Splits, ViewFiles
 from g2ard.progress import plural
 from g2ard.scene.cameras import USUAL, Cameras

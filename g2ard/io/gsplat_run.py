@@ -4,7 +4,7 @@ from pathlib import Path
 
 import g2ard.io.colmap as colmap
 from g2ard.errors import InputError
-from g2ard.io.photos import Listed
+from g2ard.io.frames import Listed
 from g2ard.io.trainer_yaml import below, read_settings
 from g2ard.io.types import ViewFiles
 

@@ -7,8 +7,8 @@ import msgspec
 import numpy as np
 
 from g2ard.io.finding import Finder
+from g2ard.io.frames import Frame, Lens, Listed, inverse, rigid
 from g2ard.io.jsonfile import Matrix, Number, Place, Vector, Whole, checked, read_any_json
-from g2ard.io.photos import Frame, Lens, Listed, inverse, rigid
 from g2ard.io.transforms import json_rows
 from g2ard.io.types import ViewFiles
 from g2ard.progress import plural

@@ -7,8 +7,8 @@ import numpy as np
 
 from g2ard.errors import InputError, damaged
 from g2ard.io.finding import photos_in
+from g2ard.io.frames import Frame, Lens, Listed, inverse, rigid
 from g2ard.io.jsonfile import Place
-from g2ard.io.photos import Frame, Lens, Listed, inverse, rigid
 from g2ard.io.types import ViewFiles
 from g2ard.progress import plural
 

@@ -11,8 +11,8 @@ import numpy as np
 import g2ard.io.colmap as colmap
 import g2ard.io.transforms as transforms
 from g2ard.errors import InputError
+from g2ard.io.frames import Frame, Listed, inverse, rigid
 from g2ard.io.jsonfile import Place, Pose, Positive, checked, read_json
-from g2ard.io.photos import Frame, Listed, inverse, rigid
 from g2ard.io.trainer_yaml import Settings, below, read_settings
 from g2ard.io.types import Float, ViewFiles
 from g2ard.scene.samples import evenly_spaced

@@ -9,8 +9,8 @@ import g2ard.io.colmap as colmap
 import g2ard.io.transforms as transforms
 from g2ard.errors import InputError
 from g2ard.io.finding import Finder
+from g2ard.io.frames import Frame, Lens, Listed, rigid
 from g2ard.io.jsonfile import Place, Pose, checked, read_any_json
-from g2ard.io.photos import Frame, Lens, Listed, rigid
 from g2ard.io.trainer_yaml import below
 from g2ard.io.types import ViewFiles
 

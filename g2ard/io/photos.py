@@ -1,464 +1,287 @@
-"""Helpers for readers of views: photos of frames within limits, and frames to cameras."""
+"""Photos and masks as images of their cameras: undistorted, resized and composited."""
 
 from __future__ import annotations
 
-import math
 from collections import Counter
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from g2ard.errors import InputError, damaged
-from g2ard.io.finding import (
-    Finder,
-    is_a_photo,
-    is_end,
-    mask_folders,
-    other_photo,
-    photos_in,
-    plain_parts,
-    readable,
-    usable,
-)
-from g2ard.io.jsonfile import Place
-from g2ard.io.paths import about, check_regular
-from g2ard.io.signs import PHOTOS, foreign
-from g2ard.io.types import Float, Note, Notes, Size, ViewSet
-from g2ard.progress import plural
-from g2ard.scene.cameras import LARGEST_IMAGE, USUAL, Cameras, check_image
+from g2ard.config.choices import BLACK, Colour
+from g2ard.errors import InputError
+from g2ard.io.finding import MOVING
+from g2ard.io.images import resized
+from g2ard.io.photo_decoding import decode_photo
+from g2ard.io.photo_headers import fits, opened_image, photo_size
+from g2ard.io.types import Float, Float32, Mask, Size
+from g2ard.scene.cameras import Cameras
 from g2ard.scene.lenses import PhotoLens
-from g2ard.scene.transform import rotation_matrices
+from g2ard.scene.samples import evenly_spaced
 
-if TYPE_CHECKING:
-    from PIL import Image
-
-ASPECT_SLACK = 0.02
-"""Relative difference in aspect ratio that rounding may cause; more means another photo."""
-
-_EXIF = 0x8769
-"""Tag of EXIF's own directory."""
-_FOCAL = 0x920A
-"""Tag of the focal length in mm."""
-_FILM_FOCAL = 0xA405
-"""Tag of the equivalent focal length on 35 mm film, in mm."""
-_SENSOR_PIXELS = 0xA20E
-"""Tag of the sensor's pixels per unit."""
-
-_SENSOR_UNIT = 0xA210
-"""Tag of that unit."""
-
-_STORED_WIDTH = 0xA002
-"""Tag of the photo's width in pixels."""
-
-_UNITS = {2: 25.4, 3: 10.0, 4: 1.0, 5: 1e-3}  # millimetres of a unit of sensor pixels: inch, cm, mm and µm
-_FILM_DIAGONAL = math.hypot(36, 24)  # diagonal of 35 mm film, mm
+_BORDER_PHOTOS = 5  # photos whose borders are compared
+_BORDER_COLOUR_SLACK = 3 / 255
+"""Largest difference from a constant border colour."""
+_BORDER_SHARE = 0.8
+"""Least share of border pixels that have a constant border colour."""
 
 
-class Lens(NamedTuple):
-    """Size, pinhole matrix and OpenCV distortion k1 k2 p1 p2 k3 of a camera, or the lens of a photo that
-    pinhole views are to be made from, or that this is such a view of (`made`)."""
+def load_photo(
+    cameras: Cameras, index: int, background: Sequence[float] | None = BLACK
+) -> tuple[Float32, Mask | None]:
+    """Read the photo of a view as an image of its pinhole camera, and its mask as `load_mask` does.
 
-    size: Size
-    K: Float
-    distortion: tuple[float, ...] = (0.0,) * 5
-    photo: PhotoLens | None = None
-    made: bool = False
-
-    def at(self, size: Size) -> Lens:
-        """Return the lens for resized photos."""
-        if size == self.size:
-            return self
-        K = self.K.copy()
-        K[0] *= size[0] / self.size[0]
-        K[1] *= size[1] / self.size[1]
-        return self._replace(size=size, K=K)
-
-    @classmethod
-    def pinhole(
-        cls,
-        size: Size,
-        focal: tuple[float, float],
-        middle: tuple[float, float] | None = None,
-        distortion: tuple[float, ...] = (0.0,) * 5,
-    ) -> Lens:
-        """Return the lens of focal lengths and a principal point, None for the middle of the image."""
-        (fx, fy), (cx, cy) = focal, (size[0] / 2, size[1] / 2) if middle is None else middle
-        return cls(size, np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], float), distortion)
-
-    @classmethod
-    def of(cls, photo: PhotoLens) -> Lens:
-        """Return the lens of a photo, from which `view_set` makes views."""
-        return cls(photo.size, np.diag([*photo.focal, 1.0]), photo=photo)
-
-
-class Frame(NamedTuple):
-    """A view as listed in a file; its `photo` may be missing, and `listed` is what the file calls it."""
-
-    name: str
-    viewmat: Float
-    lens: Lens
-    photo: Path | None
-    split: str | None = None
-    weight: float | None = None
-    mask: Path | None = None
-    kind: str = USUAL
-    listed: str = ""
-
-
-class Listed(NamedTuple):
-    """Views as a file lists them.
+    A distorted photo is undistorted at its own resolution, then resized by area. Pixels outside of the mask,
+    such as those beyond the photo's edge, have any colour. EXIF orientation counts only where the view's size
+    needs it, because poses usually refer to stored pixels. Grey becomes three equal channels, and alpha is
+    composited over the background. The image is (H, W, 3) float32 in [0, 1].
 
     Args:
-        path: the file or folder.
-        left_out: names of views with numbers that are not finite, and what is wrong.
-        notes: further notes.
+        background: None keeps alpha, as premultiplied (H, W, 4) RGBA.
     """
-
-    path: Path
-    frames: Sequence[Frame]
-    left_out: Sequence[tuple[str, InputError]] = ()
-    notes: Notes = ()
-
-    def noted(self, code: str, count: int, text: str) -> Listed:
-        """Return the views with a further note, if it counts anything."""
-        return self._replace(notes=(*self.notes, Note(code, count, text))) if count else self
-
-    def whole(self) -> Sequence[Frame]:
-        """Return the frames, or raise the error of the first view that is left out."""
-        if self.left_out:
-            raise self.left_out[0][1]
-        return self.frames
+    image = _image(cameras, index)
+    mask = _mask(cameras, index, image)
+    return (image if background is None else composited(image, background)), mask
 
 
-@contextmanager
-def opened_image(path: Path, content: IO[bytes] | None = None) -> Iterator[Image.Image]:
-    """Open `path`, or `content`, as a Pillow image after checking its size.
-
-    A missing file is an `InputError`; so are exceptions in the block, about a damaged image.
-    """
-    from PIL import Image, UnidentifiedImageError
-
-    if content is None:
-        check_regular(path)
-    with about(path):
-        try:
-            with Image.open(content or path) as image:
-                check_image(*image.size)
-                yield image
-        except InputError:
-            raise
-        except FileNotFoundError as error:
-            raise InputError("no such photo") from error
-        except Image.DecompressionBombError as error:
-            raise InputError(f"has more than {LARGEST_IMAGE:,} pixels") from error
-        except UnidentifiedImageError as error:
-            if content is None and _begins(path, _TIFF):
-                raise InputError(_OTHER_TIFF, hint=_CONVERT_TIFF) from error
-            raise InputError("is not an image") from error
-        except Exception as error:  # Pillow's decoders raise any exception for damaged files
-            raise damaged(f"cannot be decoded ({str(error) or type(error).__name__})") from error
+def composited(image: Float32, background: Sequence[float]) -> Float32:
+    """Composite premultiplied RGBA over a background; RGB is unchanged."""
+    if image.shape[2] == 4:
+        image = image[..., :3] + (1 - image[..., 3:]) * np.asarray(background, np.float32)
+    return np.ascontiguousarray(image)
 
 
-_TIFF = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
-_OTHER_TIFF = "is a TIFF of pixels that cannot be read, such as floats, or other bands than red, green, blue"
-_CONVERT_TIFF = (
-    "`gdal_translate -b 1 -b 2 -b 3 -ot Byte -scale IN.tif OUT.png` converts it, if these are its bands"
-)
-
-
-def _begins(path: Path, starts: tuple[bytes, ...]) -> bool:
-    """Return whether a file begins with one of some bytes; False if it cannot be read."""
-    with suppress(OSError), path.open("rb") as file:
-        return file.read(8).startswith(starts)
-    return False
-
-
-def photo_size(path: Path, listed_in: Path | None = None, like: tuple[float, float] | None = None) -> Size:
-    """Read width and height from a photo's header, upright by EXIF if only that fits the size `like`."""
+def _image(cameras: Cameras, index: int) -> Float32:
+    path, name = cameras.image_paths[index], cameras.names[index]
+    if path is None:
+        raise InputError(f"({name}) has no photo", index=index, item="view", hint="pass views with photos")
+    named = None if cameras.source is None else f"{cameras.source} names it as view {name!r}"
     try:
-        with opened_image(path) as image:
-            return turned(image.size) if turns(image, like) else image.size
+        target = int(cameras.widths[index]), int(cameras.heights[index])
+        lens = cameras.lenses[index]
+        image = decode_photo(path, target) if lens is None else _opened(path, _modified(path), lens.size)
     except InputError as error:
-        raise error if listed_in is None else error.at(hint=f"it is listed in {listed_in}") from None
+        raise error.at(hint="; ".join(filter(None, (error.hint, named))) or None) from error
+    height, width = image.shape[:2]
+    if lens is not None and fits((width, height), lens.size):
+        return _through(image, lens, cameras.Ks[index], target)
+    if not fits((width, height), target if lens is None else lens.size):
+        raise InputError(
+            f"the photo is {width}×{height}, its view {target[0]}×{target[1]}: the aspects differ",
+            path=path,
+            hint="pass the uncropped photos that the poses were estimated from",
+        )
+    distortion = cameras.distortions[index]
+    if distortion.any():
+        K = cameras.Ks[index] * np.array([[width / target[0]], [height / target[1]], [1.0]])
+        image = _undistorted(image, K, distortion)
+    return resized(image, target)
 
 
-def turned(size: Size) -> Size:
-    return size[1], size[0]
+@dataclass(frozen=True)
+class PhotoTraits:
+    """Properties of photos that decide which background fits them.
 
-
-def turns(image: Image.Image, like: tuple[float, float] | None) -> bool:
-    """Return whether EXIF turns an image by a quarter, and only then it has the aspect of `like`.
-
-    Poses refer to stored pixels, unless the size of their views shows that they refer to upright photos.
+    Args:
+        alpha: number of photos with alpha; 0 if none of a few has transparent pixels.
+        border: colour that a few photos share along their borders; None if it varies, or with alpha.
+        sizes: number of photos by width and height.
     """
-    if like is None or fits(image.size, like) or not fits(turned(image.size), like):
-        return False
-    return int(image.getexif().get(_ORIENTATION, 1)) in (5, 6, 7, 8)
+
+    alpha: int
+    border: Colour | None
+    sizes: Mapping[Size, int]
 
 
-def fits(size: tuple[float, float], like: tuple[float, float]) -> bool:
-    """Return whether two sizes have the same aspect."""
-    return abs(size[0] * like[1] - size[1] * like[0]) <= ASPECT_SLACK * size[1] * like[0]
+def photo_traits(files: Sequence[Path]) -> PhotoTraits:
+    """Look at the headers of all photos and the borders of a few; unreadable photos are ignored."""
+    sizes: Counter[Size] = Counter()
+    alpha = 0
+    for photo in files:
+        with suppress(InputError), opened_image(photo) as header:
+            sizes[header.size] += 1
+            alpha += header.has_transparency_data
+    few = evenly_spaced(len(files), _BORDER_PHOTOS, floor=True)
+    shown = []
+    for i in few:
+        with suppress(InputError):
+            shown.append(decode_photo(files[i]))
+    if not any(image.shape[2] == 4 and image[..., 3].min() < 1 for image in shown):
+        alpha = 0
+    edges = [np.concatenate([image[0], image[-1], image[:, 0], image[:, -1]])[:, :3] for image in shown]
+    if alpha or not edges:
+        return PhotoTraits(alpha, None, sizes)
+    border = np.concatenate(edges)
+    colour = np.median(border, axis=0)
+    same = (np.abs(border - colour).max(1) <= _BORDER_COLOUR_SLACK).mean() >= _BORDER_SHARE
+    red, green, blue = colour.tolist()
+    return PhotoTraits(0, (red, green, blue) if same else None, sizes)
 
 
-def _at_photo(lens: Lens, photo: Path) -> tuple[Lens, bool]:
-    """Return a lens for the size of its photo, if that has the same aspect, and whether EXIF turns the photo.
+def load_mask(cameras: Cameras, index: int) -> Mask | None:
+    """Read the (H, W) mask of a view's photo, in the pixels of `load_photo`; None if all count.
 
-    A photo that cannot be read changes nothing.
+    Pixels count that the photo holds and whose mask is brighter than half of its brightest pixel; for a photo
+    that is its own mask, and for a mask that is black all over, those whose alpha is above half. In a mask
+    of labels, every label above 0 counts. instant-ngp's `dynamic_mask_*` leaves out what is white.
     """
-    with suppress(Exception), opened_image(photo) as image:
-        size = turned(image.size) if turns(image, lens.size) else image.size
-        is_turned = int(image.getexif().get(_ORIENTATION, 1)) != 1
-        return (lens if lens.made or not fits(size, lens.size) else lens.at(size)), is_turned
-    return lens, False
+    return _mask(cameras, index, None)
 
 
-_ORIENTATION = 0x0112
+def _mask(cameras: Cameras, index: int, image: Float32 | None) -> Mask | None:
+    """Return the mask of a photo. A photo that is its own mask is read, unless `image` holds it."""
+    held, path = _held(cameras, index), cameras.mask_paths[index]
+    if path is None:
+        return held
+    if path == cameras.image_paths[index]:
+        own = _image(cameras, index) if image is None else image
+        mask = own[..., 3] > 0.5 if own.shape[2] == 4 else None
+    else:
+        mask = _kept(_image(replace(cameras, image_paths=cameras.mask_paths), index))
+        mask = ~mask if path.name.lower().startswith(MOVING) else mask
+    if mask is None or held is None:
+        return held if mask is None else np.ascontiguousarray(mask)
+    return np.ascontiguousarray(mask & held)
 
 
-def exif_focal(path: Path) -> float | None:
-    """Return the focal length in pixels by a photo's EXIF, None without one or for a broken photo.
+_LABELS = 32 / 255  # brightest value below which the values of a mask are labels
 
-    It comes from the focal length for 35 mm film, whose frame has a diagonal of 43.27 mm; otherwise from that
-    in millimetres and the sensor's pixels per unit.
-    """
-    try:
-        with opened_image(path) as image:
-            size, tags = image.size, image.getexif().get_ifd(_EXIF)
-    except InputError:
+
+def _kept(mask: Float32) -> Mask:
+    """Return the pixels that a mask keeps."""
+    shade = composited(mask, BLACK).max(2)
+    if mask.shape[2] == 4 and not shade.any():
+        return mask[..., 3] > 0.5
+    top = float(shade.max())
+    kept: Mask = shade > 0.5 * (top if top >= _LABELS else min(top, 1 / 255))
+    return kept
+
+
+def _held(cameras: Cameras, index: int) -> Mask | None:
+    """Return the pixels of a view that its undistorted photo holds in full, or None if all are."""
+    photo, distortion, lens = cameras.image_paths[index], cameras.distortions[index], cameras.lenses[index]
+    if photo is None or (lens is None and not distortion.any()):
         return None
-    with suppress(TypeError, ValueError, ZeroDivisionError):
-        film = float(tags.get(_FILM_FOCAL, 0))
-        found = film * math.hypot(*size) / _FILM_DIAGONAL
-        if not film:
-            per_mm = float(tags.get(_SENSOR_PIXELS, 0)) / _UNITS.get(tags.get(_SENSOR_UNIT, 2), 25.4)
-            resized = size[0] / float(tags.get(_STORED_WIDTH, size[0]))
-            found = float(tags.get(_FOCAL, 0)) * per_mm * resized
-        if 0.1 < found / max(size) < 100:
-            return found
-    return None
+    target = int(cameras.widths[index]), int(cameras.heights[index])
+    width, height = photo_size(photo, cameras.source, target if lens is None else lens.size)
+    if lens is not None:
+        times = _samples(lens, width, cameras.Ks[index])
+        samples = _lens_lookup(lens, tuple(cameras.Ks[index].ravel()), target, times)[1]
+        whole: Mask = np.all(samples.reshape(target[1], times, target[0], times), axis=(1, 3))
+        return None if whole.all() else whole
+    K = cameras.Ks[index] * np.array([[width / target[0]], [height / target[1]], [1.0]])
+    held = _held_at(width, height, tuple(K.ravel()), tuple(distortion), target)
+    return None if held.all() else held
 
 
-def rigid(matrix: Float, place: Place) -> Float:
-    """Return the rigid transform nearest to a (4, 4) or (3, 4) pose with rounding errors or a uniform scale.
+@lru_cache(maxsize=2)
+def _held_at(
+    width: int, height: int, K: tuple[float, ...], distortion: tuple[float, ...], target: Size
+) -> Mask:
+    held = _lookup(width, height, K, distortion)[-1].reshape(height, width, 1)
+    found = resized(held.astype(np.float32), target)[..., 0] > _WHOLE
+    found.flags.writeable = False
+    return found
 
-    Raise an `InputError` for a pose that is not finite, is mirrored, or differs from a rotation by over 1 %.
+
+_WHOLE = 0.999  # share of a pixel above which it counts as whole
+
+
+def _undistorted(image: Float32, K: Float, distortion: Float) -> Float32:
+    """Sample the distorted photo for each pixel of the pinhole image."""
+    height, width = image.shape[:2]
+    u, v, _ = _lookup(width, height, tuple(K.ravel()), tuple(distortion))
+    return _sampled(image, u, v).reshape(image.shape)
+
+
+def _sampled(image: Float32, u: Float, v: Float, around: bool = False) -> Float32:
+    """Return the (n, C) values at n places, bilinearly. Pixels have whole numbers, and edges are repeated.
+
+    Args:
+        around: whether the last column is beside the first, as in a panorama.
     """
-    if matrix.shape not in ((4, 4), (3, 4)) or not np.isfinite(matrix).all():
-        raise place.error("is not a finite 4×4 matrix")
-    U, s, Vt = np.linalg.svd(matrix[:3, :3])
-    R = U @ Vt
-    if not s[0] > 0 or s[2] < 0.99 * s[0] or np.linalg.det(R) < 0:
-        raise place.error("is not a rotation and a translation")
-    out = np.eye(4)
-    out[:3, :3], out[:3, 3] = R, matrix[:3, 3]
-    return out
-
-
-def posed(quat: ArrayLike, translation: ArrayLike) -> Float:
-    """Return the (4, 4) rigid transform of a quaternion wxyz, of any length, and a translation."""
-    out = np.eye(4)
-    out[:3, :3], out[:3, 3] = rotation_matrices(np.array([quat]))[0], translation
-    return out
-
-
-def inverse(matrix: Float) -> Float:
-    R, t = matrix[:3, :3], matrix[:3, 3]
-    out = np.eye(4)
-    out[:3, :3], out[:3, 3] = R.T, -R.T @ t
-    return out
-
-
-def _cameras(path: Path, frames: Sequence[Frame]) -> Cameras:
-    masks = Finder()
-    try:
-        rows = (
-            (
-                *(f.viewmat, f.lens.K, f.lens.size, f.name, f.photo),
-                *(f.lens.distortion, _mask(f, masks), f.kind, f.lens.photo),
-            )
-            for f in frames
-        )
-        return Cameras.from_lists(*map(list, zip(*rows, strict=True)))
-    except InputError as error:
-        raise error.at(path=path) from error
-    except OverflowError as error:
-        raise InputError("the size of a view is too large", path=path) from error
-
-
-def _mask(frame: Frame, masks: Finder) -> Path | None:
-    """Return the frame's mask, or that found for its photo."""
-    if frame.mask is not None or frame.photo is None:
-        return frame.mask
-    return masks.mask(frame.photo, len(plain_parts(frame.listed or frame.name)))
-
-
-def view_set(listed: Listed) -> ViewSet:
-    """Stack frames with unique names; frames whose photo is missing keep their pose only."""
-    path, frames, left_out, further = listed
-    if not frames and not listed.whole():
-        raise InputError("no views found", path=path)
-    names = readable([frame.name for frame in frames], [frame.photo for frame in frames])
-    frames = [frame._replace(name=name) for frame, name in zip(frames, names, strict=True)]
-    name, times = Counter(frame.name for frame in frames).most_common(1)[0]
-    if times > 1:
-        raise InputError(f"{times} views are named {name!r}; names must be unique", path=path)
-    notes = []
-    if left_out:
-        name, fault = left_out[0]
-        text = (
-            f"{plural(len(left_out), 'view')} left out, which numbers that are not finite describe: {fault}"
-        )
-        notes.append(Note("not_finite", len(left_out), f"{text} (view {name!r})"))
-    frames, found_notes = _checked_photos(frames)
-    notes += found_notes
-    if bent := [frame for frame in frames if frame.lens.photo is not None and not frame.lens.made]:
-        frames = [view for frame in frames for view in _pinholes(frame)]
-        models = ", ".join(sorted({frame.lens.photo.model for frame in bent if frame.lens.photo}))
-        made = sum(frame.lens.photo is not None for frame in frames)
-        text = f"{plural(len(bent), 'photo')} ({models}) resampled to {plural(made, 'pinhole view')}"
-        notes.append(Note("resampled", made, text))
-    pictured = [frame for frame in frames if frame.photo is not None]
-    present = [frame for frame in pictured if frame.photo and usable(frame.photo)]
-    if present and len(present) < len(frames):
-        there = {frame.name for frame in present}
-        frames = [f if f.name in there else f._replace(photo=None, mask=None) for f in frames]
-    elif not present and pictured:
-        text = f"none of {plural(len(pictured), 'photo')} found; using poses only"
-        notes.append(Note("no_photos", len(pictured), f"{text} (the first is {pictured[0].photo})"))
-        frames = [frame._replace(photo=None) for frame in frames]
-    cameras = replace(_cameras(path, frames), source=path)
-    masked = sum(mask is not None for mask in cameras.mask_paths)
-    if masked:
-        notes.append(Note("masks", masked, f"{plural(masked, 'photo')} of {len(present)} have masks"))
-    elif present and (folders := _idle_masks(present)):
-        text = f"no mask in {folders[0]} is named like a photo, as {present[0].name}.png would be"
-        notes.append(Note("unused_masks", 1, text))
-    splits = tuple(f.split for f in frames)
-    weights = [f.weight for f in frames]
-    return ViewSet(
-        cameras,
-        (*notes, *further),
-        splits if any(splits) else (),
-        None if set(weights) == {None} else np.array([1.0 if w is None else w for w in weights]),
+    height, width = image.shape[:2]
+    u, v = u if around else np.clip(u, 0, width - 1), np.clip(v, 0, height - 1)
+    left, above = np.floor(u).astype(int), np.floor(v).astype(int)
+    right, down = (u - left)[:, None].astype(np.float32), (v - above)[:, None].astype(np.float32)
+    top, bottom = (
+        image[row, left % width] * (1 - right) + image[row, (left + 1) % width] * right
+        for row in (above, np.minimum(above + 1, height - 1))
     )
+    return np.asarray(top * (1 - down) + bottom * down)
 
 
-def _pinholes(frame: Frame) -> list[Frame]:
-    """Return the pinhole views of a frame, which is its only one unless its lens needs several."""
-    lens = frame.lens.photo
-    if lens is None or frame.lens.made:
-        return [frame]
-    views = []
-    for face, turn, K, size in lens.faces(frame.lens.size[0] / lens.size[0]):
-        viewmat = np.eye(4)
-        viewmat[:3] = turn.T @ frame.viewmat[:3]
-        name = f"{frame.name}#{face}" if face else frame.name
-        own = Lens(size, K, photo=lens.turned(turn), made=True)
-        views.append(frame._replace(name=name, viewmat=viewmat, lens=own))
-    return views
+@lru_cache(maxsize=2)  # usually all photos share one lens
+def _lookup(
+    width: int, height: int, K: tuple[float, ...], distortion: tuple[float, ...]
+) -> tuple[Float, Float, Mask]:
+    """Return column and row of each pixel's source, and whether the photo holds it.
 
+    OpenCV's model, pixel centres at +0.5:
 
-def _idle_masks(present: Sequence[Frame]) -> list[Path]:
-    """Return folders of masks for the first photo that hold images."""
-    photo, name = present[0].photo, present[0].listed or present[0].name
-    folders = mask_folders(photo, len(plain_parts(name))) if photo else []
-    return [folder for folder, _ in folders if photos_in(folder, below=True)]
-
-
-_PHOTO_NOTES = {
-    "unreadable_photos": "of {views} cannot be read: {first}; convert to JPEG or PNG",
-    "equal_names": "not found among equal names in folders: {first}",
-    "other_suffix": "found with another suffix: {first}",
-    "exif_orientation": "with an EXIF orientation (the first is {first}): turned where only that fits the "
-    "size of the view, otherwise read as stored",
-    "other_size": "of another size than the file says, which their views take ({first})",
-    "other_spelling": "found with another spelling, Unicode form or character set: {first}",
-}
-"""Code of a note on photos → its text after their number."""
-
-
-def _checked_photos(frames: Sequence[Frame]) -> tuple[list[Frame], list[Note]]:
-    """Drop photos that cannot be read, and photos that names of several folders were shortened to."""
-    out, found = list(frames), {code: list[str]() for code in _PHOTO_NOTES}
-    times = Counter(frame.photo for frame in frames)
-    for i, frame in enumerate(frames):
-        photo, wanted = frame.photo, Path(frame.listed)
-        if photo is None or not usable(photo):
-            continue
-        if (what := unreadable(photo)) is not None:
-            found["unreadable_photos"].append(f"{frame.name} is {what}")
-            out[i] = frame._replace(photo=None, mask=None)
-        elif frame.listed and times[photo] > 1 and not is_end(frame.listed, photo):
-            found["equal_names"].append(f"{frame.name} is not {photo}, which another view has")
-            out[i] = frame._replace(photo=None, mask=None)
-        else:
-            if is_a_photo(wanted) and photo.suffix.lower() != wanted.suffix.lower():
-                found["other_suffix"].append(f"{frame.name} is {photo.name}")
-            elif is_a_photo(wanted) and plain_parts(frame.listed)[-1].lower() != photo.name.lower():
-                found["other_spelling"].append(f"{frame.name} is {photo.name}")
-            lens, is_turned = _at_photo(frame.lens, photo)
-            if is_turned:
-                found["exif_orientation"].append(photo.name)
-            if lens.size != frame.lens.size:
-                sizes = "{}×{} instead of {}×{}".format(*lens.size, *frame.lens.size)
-                found["other_size"].append(f"{frame.name} is {sizes}")
-                out[i] = frame._replace(lens=lens)
-    notes = []
-    for code, photos in found.items():
-        if photos:
-            text = _PHOTO_NOTES[code].format(first=photos[0], views=len(frames))
-            notes.append(Note(code, len(photos), f"{plural(len(photos), 'photo')} {text}"))
-    return out, notes
-
-
-def unreadable(photo: Path) -> str | None:
-    """Return the format of a photo that cannot be read, by its suffix and first bytes, or None."""
-    if (by_suffix := other_photo(photo)) is not None:
-        return by_suffix
-    if _begins(photo, _TIFF):
-        try:
-            with opened_image(photo):
-                return None
-        except InputError as error:
-            return f"{error.message.removeprefix('is ')} ({error.hint})" if error.hint else None
-    sign = None if _begins(photo, PHOTOS) else foreign(photo)
-    return None if sign is None else f"{sign.what} ({sign.todo})"
-
-
-def pictured(found: ViewSet) -> ViewSet:
-    """Return the views with a photo, and a note on the others; all views if none has a photo."""
-    has = np.array([path is not None for path in found.cameras.image_paths], bool)
-    missing = int(np.count_nonzero(~has))
-    if not missing or missing == len(has):
-        return found
-    first = found.cameras.names[int(np.argmin(has))]
-    text = f"{plural(missing, 'view')} of {len(has)} skipped: no photo (the first is {first!r})"
-    return found.take(has).noted("missing_photos", missing, text)
-
-
-def alpha_as_masks(found: ViewSet) -> ViewSet:
-    """Make each photo with alpha and without a mask its own mask, and note how many."""
-    cameras = found.cameras
-    own = [
-        mask is None and photo is not None and has_alpha(photo)
-        for photo, mask in zip(cameras.image_paths, cameras.mask_paths, strict=True)
+    x' = x·(1 + k1 r² + k2 r⁴ + k3 r⁶) + 2 p1 x y + p2 (r² + 2 x²), y' likewise with p1 and p2 exchanged.
+    """
+    k1, k2, p1, p2, k3 = distortion
+    matrix = np.array(K).reshape(3, 3)
+    v, u = np.mgrid[0:height, 0:width] + 0.5
+    x, y, _ = np.linalg.inv(matrix) @ np.stack([u.ravel(), v.ravel(), np.ones(u.size)])
+    r2 = x * x + y * y
+    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    bent = [
+        x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
+        y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
+        np.ones_like(x),
     ]
-    pairs = zip(own, cameras.image_paths, cameras.mask_paths, strict=True)
-    masks = tuple(photo if use else mask for use, photo, mask in pairs)
-    text = f"{plural(sum(own), 'photo')} of {len(own)} masked by alpha"
-    return replace(found, cameras=replace(cameras, mask_paths=masks)).noted("alpha_masks", sum(own), text)
+    u, v = matrix[:2] @ bent - 0.5
+    held = (u >= -0.5) & (u <= width - 0.5) & (v >= -0.5) & (v <= height - 0.5) & (r2 < _fold(k1, k2, k3))
+    return u, v, held
 
 
-def has_alpha(photo: Path) -> bool:
-    """Return whether a photo's header declares transparency; False if it cannot be read."""
+def _modified(path: Path) -> int | None:
+    """Return a photo's time, None if it is missing, as `decode_photo` will say."""
     try:
-        with opened_image(photo) as image:
-            return image.has_transparency_data
-    except InputError:
-        return False
+        return path.stat().st_mtime_ns
+    except OSError:
+        return None
+
+
+@lru_cache(maxsize=1)  # several views of a photo follow each other
+def _opened(path: Path, modified: int | None, like: Size) -> Float32:
+    return decode_photo(path, like)
+
+
+def _through(image: Float32, lens: PhotoLens, K: Float, size: Size) -> Float32:
+    """Sample a photo through its lens for each pixel of a pinhole view: bilinearly at as many points a pixel
+    as the photo is finer, which are averaged."""
+    height, width = image.shape[:2]
+    times = _samples(lens, width, K)
+    pixels, _ = _lens_lookup(lens, tuple(K.ravel()), size, times)
+    u, v = (pixels * (np.array([width, height]) / lens.size) - 0.5).T
+    samples = _sampled(image, u, v, around=lens.model == "EQUIRECTANGULAR")
+    return resized(samples.reshape(size[1] * times, size[0] * times, -1), size)
+
+
+_MOST_SAMPLES = 8
+
+
+def _samples(lens: PhotoLens, width: int, K: Float) -> int:
+    """Return the number of samples along each side of a pixel: the pixels of a photo of this width there."""
+    finer = width / lens.size[0] * max(lens.focal) / min(K[0, 0], K[1, 1])
+    return int(np.clip(np.ceil(finer - 0.01), 1, _MOST_SAMPLES))
+
+
+@lru_cache(maxsize=6)  # the faces of a cube
+def _lens_lookup(lens: PhotoLens, K: tuple[float, ...], size: Size, times: int) -> tuple[Float, Mask]:
+    """Return the pixel of a lens for each sample of a pinhole view, and whether its photo holds it."""
+    v, u = (np.mgrid[0 : size[1] * times, 0 : size[0] * times] + 0.5) / times
+    rays = np.stack([u.ravel(), v.ravel(), np.ones(u.size)], 1) @ np.linalg.inv(np.array(K).reshape(3, 3)).T
+    return lens.project(rays)
+
+
+def _fold(k1: float, k2: float, k3: float) -> float:
+    """Return r² where r·(1 + k1 r² + k2 r⁴ + k3 r⁶) stops growing, where the lens model ends."""
+    roots = np.roots([7 * k3, 5 * k2, 3 * k1, 1])
+    return min((root.real for root in roots if abs(root.imag) < 1e-9 and root.real > 0), default=np.inf)

@@ -7,8 +7,8 @@ import numpy as np
 
 from g2ard.errors import InputError
 from g2ard.io.finding import Finder, files_in
+from g2ard.io.frames import Frame, Lens, Listed, rigid
 from g2ard.io.jsonfile import Number, Place, Whole, checked, read_json
-from g2ard.io.photos import Frame, Lens, Listed, rigid
 from g2ard.io.transforms import opencv_view
 from g2ard.io.types import ViewFiles
 

@@ -25,7 +25,7 @@ from g2ard.errors import InputError, damaged
 from g2ard.io.jsonfile import FileName, Place, Vector, Whole, checked, parse_json, read_json
 from g2ard.io.packing import from_smallest_three
 from g2ard.io.paths import check_regular, check_unpacked, decoded, file_identity
-from g2ard.io.photos import opened_image
+from g2ard.io.photo_headers import opened_image
 from g2ard.io.sanitize import BLOCK, Raw, logits_of
 from g2ard.io.stream import RawStream, from_row
 from g2ard.io.types import Bytes, Float32, Note, Values

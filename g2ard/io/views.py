@@ -123,7 +123,7 @@ def read_view_set(
         unpictured: whether to keep views without photos among others.
         alpha: "mask" makes a photo with alpha and without a mask its own mask.
     """
-    from g2ard.io.photos import alpha_as_masks, pictured, view_set
+    from g2ard.io.frames import alpha_as_masks, pictured, view_set
     from g2ard.io.splits import split_mask
     from g2ard.io.types import ViewFiles
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from g2ard.config.choices import Axes, RenderModel
 from g2ard.errors import InputError
 from g2ard.io import Source, read_view_set
-from g2ard.io.images import find_exposures
+from g2ard.io.exposures import find_exposures
 from g2ard.io.splits import (
     for_scores,
     for_training,

@@ -16,7 +16,8 @@ from g2ard.config.checks import checks_arguments
 from g2ard.config.choices import Colour
 from g2ard.errors import InputError
 from g2ard.io import Source
-from g2ard.io.images import load_photo, png_bytes, resized
+from g2ard.io.images import png_bytes, resized
+from g2ard.io.photos import load_photo
 from g2ard.io.reports import Report
 from g2ard.jobs.comparison import made_of_points
 from g2ard.jobs.inputs import GivenViews, Views, load_scene

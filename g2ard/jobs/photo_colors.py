@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from g2ard.io.images import load_photo
+from g2ard.io.photos import load_photo
 from g2ard.io.types import Cloud, Points
 from g2ard.progress import Progress, Say, plural, silent
 from g2ard.scene.cameras import Cameras

@@ -19,9 +19,9 @@ from g2ard.errors import G2ardError, InputError
 from g2ard.io import Source, read_cloud
 from g2ard.io.detect import file_format
 from g2ard.io.finding import Finder
-from g2ard.io.images import composited, load_photo
 from g2ard.io.jsonfile import read_json
 from g2ard.io.paths import real_path
+from g2ard.io.photos import composited, load_photo
 from g2ard.io.stream import PointStream
 from g2ard.io.types import Cloud, Points, ViewFiles
 from g2ard.jobs.inputs import Views

@@ -20,7 +20,7 @@ from g2ard.io import read_view_set
 from g2ard.io.cambridge import read_ace
 from g2ard.io.detect import file_format
 from g2ard.io.finding import photos_in
-from g2ard.io.photos import exif_focal, fits, has_alpha, photo_size
+from g2ard.io.photo_headers import exif_focal, fits, has_alpha, photo_size
 from g2ard.io.signs import explained
 from g2ard.jobs.inputs import load_scene
 from g2ard.jobs.trajectory import is_trajectory, read_trajectory

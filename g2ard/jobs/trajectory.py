@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g2ard.errors import InputError
+from g2ard.io.frames import inverse, posed, rigid
 from g2ard.io.jsonfile import Place
 from g2ard.io.paths import read_text
-from g2ard.io.photos import inverse, posed, rigid
 from g2ard.io.signs import sign_of
 
 _UNITS = 10.0 ** np.arange(-9, 10, 3)  # of times, in units of the names of photos

@@ -5,10 +5,10 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from g2ard.config.choices import Colour, is_made
+from g2ard.config.choices import Colour, colour_text, is_made
 from g2ard.errors import InputError
 from g2ard.io import find_views, read_view_set
-from g2ard.io.images import colour_text, photo_traits
+from g2ard.io.photos import photo_traits
 from g2ard.io.splits import split_mask
 from g2ard.jobs.inputs import GivenViews, Views
 from g2ard.progress import Say, plural, unsaid

@@ -16,8 +16,8 @@ from numpy.typing import ArrayLike, NDArray
 from g2ard.config.checks import checks_arguments
 from g2ard.config.choices import BLACK, Colour
 from g2ard.errors import InputError, require
-from g2ard.io.images import load_mask, load_photo
 from g2ard.io.paths import file_identity
+from g2ard.io.photos import load_mask, load_photo
 from g2ard.progress import Progress, plural, silent
 from g2ard.rendering.renderer import RasterSettings, Renderer
 from g2ard.scene.cameras import Cameras

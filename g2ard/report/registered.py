@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from g2ard.config.choices import Colour
 from g2ard.errors import InputError
-from g2ard.io.images import load_photo, to_bytes
+from g2ard.io.images import to_bytes
+from g2ard.io.photos import load_photo
 from g2ard.progress import plural
 from g2ard.rendering.renderer import Renderer
 from g2ard.report.page import Page, Shown

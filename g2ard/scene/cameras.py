@@ -155,7 +155,7 @@ class Cameras(Shown):
         names: C unique names of photos or poses.
         image_paths: C paths of photos or None.
         mask_paths: C paths of masks or None.
-        distortions: (C, 5) float64, OpenCV k1 k2 p1 p2 k3 of the *photo*; `g2ard.io.images` undistorts on
+        distortions: (C, 5) float64, OpenCV k1 k2 p1 p2 k3 of the *photo*; `g2ard.io.photos` undistorts on
             loading, to these Ks. Zero for a pinhole photo.
         source: the file or folder that lists the views, for messages; None for views created in memory.
         kinds: C kinds of views, such as "near" or "anywhere"; () for "usual" ones. Simplification uses usual

@@ -10,7 +10,7 @@ import pytest
 from g2ard import io
 from g2ard.errors import InputError
 from g2ard.io.detect import KINDS, MODULES
-from g2ard.io.images import load_photo
+from g2ard.io.photos import load_photo
 from helpers.dataset_files import POSES, cambridge, llff, mip_nerf_360, opengl, polycam
 from helpers.faults import faulty
 from helpers.view_files import photo

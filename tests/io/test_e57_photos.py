@@ -12,7 +12,7 @@ from pye57 import libe57
 import g2ard
 from g2ard.errors import InputError
 from g2ard.io import read_cloud, read_views
-from g2ard.io.images import load_mask, load_photo
+from g2ard.io.photos import load_mask, load_photo
 from g2ard.io.views import read_view_set
 from helpers.commands import CommandLine, succeeds
 from reference.rotations import rotations

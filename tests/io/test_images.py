@@ -12,8 +12,9 @@ from PIL import Image
 
 from g2ard.errors import InputError, OutputError
 from g2ard.io.finding import Finder
-from g2ard.io.images import load_mask, load_photo, to_bytes, write_png
-from g2ard.io.photos import unreadable
+from g2ard.io.images import to_bytes, write_png
+from g2ard.io.photo_headers import unreadable
+from g2ard.io.photos import load_mask, load_photo
 from g2ard.scene.cameras import Cameras
 from helpers.scenes import around
 

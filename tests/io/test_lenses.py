@@ -9,7 +9,7 @@ from PIL import Image
 
 import g2ard
 from g2ard.io import read_views, write_views
-from g2ard.io.images import load_mask, load_photo
+from g2ard.io.photos import load_mask, load_photo
 from g2ard.io.views import read_view_set
 from g2ard.scene.lenses import FACES, PhotoLens
 from helpers.view_files import colmap, edit, orbit, transforms

@@ -16,7 +16,7 @@ import pytest
 
 from g2ard.errors import InputError
 from g2ard.io import kind, read_splats, read_view_set, write_splats, write_views
-from g2ard.io.images import load_photo
+from g2ard.io.photos import load_photo
 from g2ard.scene.splats import Splats, unit_quats
 from g2ard.stages.simplify import simplify
 from helpers.commands import CommandLine

@@ -11,7 +11,7 @@ from PIL import Image
 from g2ard.errors import InputError
 from g2ard.io import kind, read_views
 from g2ard.io.finding import Finder
-from g2ard.io.images import load_mask, load_photo
+from g2ard.io.photos import load_mask, load_photo
 from g2ard.io.types import ViewFiles
 from g2ard.io.views import read_view_set
 from g2ard.jobs.photo_points import sparse_file, sparse_points

@@ -20,7 +20,7 @@ from PIL import Image
 
 import g2ard
 from g2ard.errors import InputError
-from g2ard.io.images import load_photo
+from g2ard.io.photos import load_photo
 from g2ard.io.reports import Report
 from g2ard.rendering.targets import fingerprint_of
 from g2ard.scene.lenses import PhotoLens

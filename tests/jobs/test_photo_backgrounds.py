@@ -12,7 +12,8 @@ from PIL import Image
 import g2ard
 from g2ard.io import read_view_set, write_splats
 from g2ard.io.describe import describe
-from g2ard.io.images import photo_traits, write_png
+from g2ard.io.images import write_png
+from g2ard.io.photos import photo_traits
 from g2ard.io.types import ViewFiles
 from g2ard.rendering.targets import Photos
 from helpers.commands import CommandLine, refused, succeeds

@@ -11,7 +11,8 @@ import pytest
 import g2ard
 from g2ard.errors import InputError
 from g2ard.io import Source
-from g2ard.io.images import load_photo, write_png
+from g2ard.io.images import write_png
+from g2ard.io.photos import load_photo
 from g2ard.io.types import Points
 from g2ard.jobs.budget import Budget
 from g2ard.jobs.distill import prepare

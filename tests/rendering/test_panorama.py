@@ -8,7 +8,8 @@ from PIL import Image
 
 import g2ard
 from g2ard.errors import InputError
-from g2ard.io.images import load_photo, write_png
+from g2ard.io.images import write_png
+from g2ard.io.photos import load_photo
 from g2ard.scene.cameras import Camera, look_at
 from g2ard.scene.lenses import FACES, PhotoLens, panorama_rays
 from helpers.commands import CommandLine, succeeds

@@ -15,7 +15,9 @@ from g2ard import io
 from g2ard.config.choices import BLACK
 from g2ard.errors import InputError
 from g2ard.io import images
-from g2ard.io.images import find_exposures, load_mask, write_png
+from g2ard.io.exposures import find_exposures
+from g2ard.io.images import write_png
+from g2ard.io.photos import load_mask
 from g2ard.io.types import ViewFiles
 from g2ard.jobs.photo_points import points_along_rays
 from g2ard.rendering.metrics import psnr, ssim

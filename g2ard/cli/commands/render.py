@@ -85,7 +85,8 @@ def render(
     up: opt.UpOption = None,
 ) -> None:
     """Render views of a scene as PNG or as an animation."""
-    from g2ard.io.images import to_bytes, write_animation, write_png
+    from g2ard.io.animations import write_animation
+    from g2ard.io.images import to_bytes, write_png
     from g2ard.jobs.inputs import GivenViews, load_views
     from g2ard.jobs.run_views import at_size, is_planned, looks_at, orbit, planned_at, views_or_pool
     from g2ard.jobs.view_checks import warn_of_sight
@@ -185,7 +186,7 @@ def render(
 
 def _folder_or_file(run: Run, output: Path | None, depth: bool) -> tuple[Path | None, Path | None]:
     """Check the output, and return it as a folder or as the file of a picture or an animation."""
-    from g2ard.io.images import ANIMATIONS, check_animation
+    from g2ard.io.animations import ANIMATIONS, check_animation
 
     if output is None:
         return None, None

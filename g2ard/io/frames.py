@@ -1,0 +1,317 @@
+"""Views as files list them, and the cameras they become: photos within limits, poses that are rigid."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from g2ard.errors import InputError
+from g2ard.io.finding import (
+    Finder,
+    is_a_photo,
+    is_end,
+    mask_folders,
+    photos_in,
+    plain_parts,
+    readable,
+    usable,
+)
+from g2ard.io.jsonfile import Place
+from g2ard.io.photo_headers import fits, has_alpha, opened_image, orientation, turned, turns, unreadable
+from g2ard.io.types import Float, Note, Notes, Size, ViewSet
+from g2ard.progress import plural
+from g2ard.scene.cameras import USUAL, Cameras
+from g2ard.scene.lenses import PhotoLens
+from g2ard.scene.transform import rotation_matrices
+
+
+class Lens(NamedTuple):
+    """Size, pinhole matrix and OpenCV distortion k1 k2 p1 p2 k3 of a camera, or the lens of a photo that
+    pinhole views are to be made from, or that this is such a view of (`made`)."""
+
+    size: Size
+    K: Float
+    distortion: tuple[float, ...] = (0.0,) * 5
+    photo: PhotoLens | None = None
+    made: bool = False
+
+    def at(self, size: Size) -> Lens:
+        """Return the lens for resized photos."""
+        if size == self.size:
+            return self
+        K = self.K.copy()
+        K[0] *= size[0] / self.size[0]
+        K[1] *= size[1] / self.size[1]
+        return self._replace(size=size, K=K)
+
+    @classmethod
+    def pinhole(
+        cls,
+        size: Size,
+        focal: tuple[float, float],
+        middle: tuple[float, float] | None = None,
+        distortion: tuple[float, ...] = (0.0,) * 5,
+    ) -> Lens:
+        """Return the lens of focal lengths and a principal point, None for the middle of the image."""
+        (fx, fy), (cx, cy) = focal, (size[0] / 2, size[1] / 2) if middle is None else middle
+        return cls(size, np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], float), distortion)
+
+    @classmethod
+    def of(cls, photo: PhotoLens) -> Lens:
+        """Return the lens of a photo, from which `view_set` makes views."""
+        return cls(photo.size, np.diag([*photo.focal, 1.0]), photo=photo)
+
+
+class Frame(NamedTuple):
+    """A view as listed in a file; its `photo` may be missing, and `listed` is what the file calls it."""
+
+    name: str
+    viewmat: Float
+    lens: Lens
+    photo: Path | None
+    split: str | None = None
+    weight: float | None = None
+    mask: Path | None = None
+    kind: str = USUAL
+    listed: str = ""
+
+
+class Listed(NamedTuple):
+    """Views as a file lists them.
+
+    Args:
+        path: the file or folder.
+        left_out: names of views with numbers that are not finite, and what is wrong.
+        notes: further notes.
+    """
+
+    path: Path
+    frames: Sequence[Frame]
+    left_out: Sequence[tuple[str, InputError]] = ()
+    notes: Notes = ()
+
+    def noted(self, code: str, count: int, text: str) -> Listed:
+        """Return the views with a further note, if it counts anything."""
+        return self._replace(notes=(*self.notes, Note(code, count, text))) if count else self
+
+    def whole(self) -> Sequence[Frame]:
+        """Return the frames, or raise the error of the first view that is left out."""
+        if self.left_out:
+            raise self.left_out[0][1]
+        return self.frames
+
+
+def _at_photo(lens: Lens, photo: Path) -> tuple[Lens, bool]:
+    """Return a lens for the size of its photo, if that has the same aspect, and whether EXIF turns the photo.
+
+    A photo that cannot be read changes nothing.
+    """
+    with suppress(Exception), opened_image(photo) as image:
+        size = turned(image.size) if turns(image, lens.size) else image.size
+        is_turned = orientation(image) != 1
+        return (lens if lens.made or not fits(size, lens.size) else lens.at(size)), is_turned
+    return lens, False
+
+
+def rigid(matrix: Float, place: Place) -> Float:
+    """Return the rigid transform nearest to a (4, 4) or (3, 4) pose with rounding errors or a uniform scale.
+
+    Raise an `InputError` for a pose that is not finite, is mirrored, or differs from a rotation by over 1 %.
+    """
+    if matrix.shape not in ((4, 4), (3, 4)) or not np.isfinite(matrix).all():
+        raise place.error("is not a finite 4×4 matrix")
+    U, s, Vt = np.linalg.svd(matrix[:3, :3])
+    R = U @ Vt
+    if not s[0] > 0 or s[2] < 0.99 * s[0] or np.linalg.det(R) < 0:
+        raise place.error("is not a rotation and a translation")
+    out = np.eye(4)
+    out[:3, :3], out[:3, 3] = R, matrix[:3, 3]
+    return out
+
+
+def posed(quat: ArrayLike, translation: ArrayLike) -> Float:
+    """Return the (4, 4) rigid transform of a quaternion wxyz, of any length, and a translation."""
+    out = np.eye(4)
+    out[:3, :3], out[:3, 3] = rotation_matrices(np.array([quat]))[0], translation
+    return out
+
+
+def inverse(matrix: Float) -> Float:
+    R, t = matrix[:3, :3], matrix[:3, 3]
+    out = np.eye(4)
+    out[:3, :3], out[:3, 3] = R.T, -R.T @ t
+    return out
+
+
+def _cameras(path: Path, frames: Sequence[Frame]) -> Cameras:
+    masks = Finder()
+    try:
+        rows = (
+            (
+                *(f.viewmat, f.lens.K, f.lens.size, f.name, f.photo),
+                *(f.lens.distortion, _mask(f, masks), f.kind, f.lens.photo),
+            )
+            for f in frames
+        )
+        return Cameras.from_lists(*map(list, zip(*rows, strict=True)))
+    except InputError as error:
+        raise error.at(path=path) from error
+    except OverflowError as error:
+        raise InputError("the size of a view is too large", path=path) from error
+
+
+def _mask(frame: Frame, masks: Finder) -> Path | None:
+    """Return the frame's mask, or that found for its photo."""
+    if frame.mask is not None or frame.photo is None:
+        return frame.mask
+    return masks.mask(frame.photo, len(plain_parts(frame.listed or frame.name)))
+
+
+def view_set(listed: Listed) -> ViewSet:
+    """Stack frames with unique names; frames whose photo is missing keep their pose only."""
+    path, frames, left_out, further = listed
+    if not frames and not listed.whole():
+        raise InputError("no views found", path=path)
+    names = readable([frame.name for frame in frames], [frame.photo for frame in frames])
+    frames = [frame._replace(name=name) for frame, name in zip(frames, names, strict=True)]
+    name, times = Counter(frame.name for frame in frames).most_common(1)[0]
+    if times > 1:
+        raise InputError(f"{times} views are named {name!r}; names must be unique", path=path)
+    notes = []
+    if left_out:
+        name, fault = left_out[0]
+        text = (
+            f"{plural(len(left_out), 'view')} left out, which numbers that are not finite describe: {fault}"
+        )
+        notes.append(Note("not_finite", len(left_out), f"{text} (view {name!r})"))
+    frames, found_notes = _checked_photos(frames)
+    notes += found_notes
+    if bent := [frame for frame in frames if frame.lens.photo is not None and not frame.lens.made]:
+        frames = [view for frame in frames for view in _pinholes(frame)]
+        models = ", ".join(sorted({frame.lens.photo.model for frame in bent if frame.lens.photo}))
+        made = sum(frame.lens.photo is not None for frame in frames)
+        text = f"{plural(len(bent), 'photo')} ({models}) resampled to {plural(made, 'pinhole view')}"
+        notes.append(Note("resampled", made, text))
+    pictured = [frame for frame in frames if frame.photo is not None]
+    present = [frame for frame in pictured if frame.photo and usable(frame.photo)]
+    if present and len(present) < len(frames):
+        there = {frame.name for frame in present}
+        frames = [f if f.name in there else f._replace(photo=None, mask=None) for f in frames]
+    elif not present and pictured:
+        text = f"none of {plural(len(pictured), 'photo')} found; using poses only"
+        notes.append(Note("no_photos", len(pictured), f"{text} (the first is {pictured[0].photo})"))
+        frames = [frame._replace(photo=None) for frame in frames]
+    cameras = replace(_cameras(path, frames), source=path)
+    masked = sum(mask is not None for mask in cameras.mask_paths)
+    if masked:
+        notes.append(Note("masks", masked, f"{plural(masked, 'photo')} of {len(present)} have masks"))
+    elif present and (folders := _idle_masks(present)):
+        text = f"no mask in {folders[0]} is named like a photo, as {present[0].name}.png would be"
+        notes.append(Note("unused_masks", 1, text))
+    splits = tuple(f.split for f in frames)
+    weights = [f.weight for f in frames]
+    return ViewSet(
+        cameras,
+        (*notes, *further),
+        splits if any(splits) else (),
+        None if set(weights) == {None} else np.array([1.0 if w is None else w for w in weights]),
+    )
+
+
+def _pinholes(frame: Frame) -> list[Frame]:
+    """Return the pinhole views of a frame, which is its only one unless its lens needs several."""
+    lens = frame.lens.photo
+    if lens is None or frame.lens.made:
+        return [frame]
+    views = []
+    for face, turn, K, size in lens.faces(frame.lens.size[0] / lens.size[0]):
+        viewmat = np.eye(4)
+        viewmat[:3] = turn.T @ frame.viewmat[:3]
+        name = f"{frame.name}#{face}" if face else frame.name
+        own = Lens(size, K, photo=lens.turned(turn), made=True)
+        views.append(frame._replace(name=name, viewmat=viewmat, lens=own))
+    return views
+
+
+def _idle_masks(present: Sequence[Frame]) -> list[Path]:
+    """Return folders of masks for the first photo that hold images."""
+    photo, name = present[0].photo, present[0].listed or present[0].name
+    folders = mask_folders(photo, len(plain_parts(name))) if photo else []
+    return [folder for folder, _ in folders if photos_in(folder, below=True)]
+
+
+_PHOTO_NOTES = {
+    "unreadable_photos": "of {views} cannot be read: {first}; convert to JPEG or PNG",
+    "equal_names": "not found among equal names in folders: {first}",
+    "other_suffix": "found with another suffix: {first}",
+    "exif_orientation": "with an EXIF orientation (the first is {first}): turned where only that fits the "
+    "size of the view, otherwise read as stored",
+    "other_size": "of another size than the file says, which their views take ({first})",
+    "other_spelling": "found with another spelling, Unicode form or character set: {first}",
+}
+"""Code of a note on photos → its text after their number."""
+
+
+def _checked_photos(frames: Sequence[Frame]) -> tuple[list[Frame], list[Note]]:
+    """Drop photos that cannot be read, and photos that names of several folders were shortened to."""
+    out, found = list(frames), {code: list[str]() for code in _PHOTO_NOTES}
+    times = Counter(frame.photo for frame in frames)
+    for i, frame in enumerate(frames):
+        photo, wanted = frame.photo, Path(frame.listed)
+        if photo is None or not usable(photo):
+            continue
+        if (what := unreadable(photo)) is not None:
+            found["unreadable_photos"].append(f"{frame.name} is {what}")
+            out[i] = frame._replace(photo=None, mask=None)
+        elif frame.listed and times[photo] > 1 and not is_end(frame.listed, photo):
+            found["equal_names"].append(f"{frame.name} is not {photo}, which another view has")
+            out[i] = frame._replace(photo=None, mask=None)
+        else:
+            if is_a_photo(wanted) and photo.suffix.lower() != wanted.suffix.lower():
+                found["other_suffix"].append(f"{frame.name} is {photo.name}")
+            elif is_a_photo(wanted) and plain_parts(frame.listed)[-1].lower() != photo.name.lower():
+                found["other_spelling"].append(f"{frame.name} is {photo.name}")
+            lens, is_turned = _at_photo(frame.lens, photo)
+            if is_turned:
+                found["exif_orientation"].append(photo.name)
+            if lens.size != frame.lens.size:
+                sizes = "{}×{} instead of {}×{}".format(*lens.size, *frame.lens.size)
+                found["other_size"].append(f"{frame.name} is {sizes}")
+                out[i] = frame._replace(lens=lens)
+    notes = []
+    for code, photos in found.items():
+        if photos:
+            text = _PHOTO_NOTES[code].format(first=photos[0], views=len(frames))
+            notes.append(Note(code, len(photos), f"{plural(len(photos), 'photo')} {text}"))
+    return out, notes
+
+
+def pictured(found: ViewSet) -> ViewSet:
+    """Return the views with a photo, and a note on the others; all views if none has a photo."""
+    has = np.array([path is not None for path in found.cameras.image_paths], bool)
+    missing = int(np.count_nonzero(~has))
+    if not missing or missing == len(has):
+        return found
+    first = found.cameras.names[int(np.argmin(has))]
+    text = f"{plural(missing, 'view')} of {len(has)} skipped: no photo (the first is {first!r})"
+    return found.take(has).noted("missing_photos", missing, text)
+
+
+def alpha_as_masks(found: ViewSet) -> ViewSet:
+    """Make each photo with alpha and without a mask its own mask, and note how many."""
+    cameras = found.cameras
+    own = [
+        mask is None and photo is not None and has_alpha(photo)
+        for photo, mask in zip(cameras.image_paths, cameras.mask_paths, strict=True)
+    ]
+    pairs = zip(own, cameras.image_paths, cameras.mask_paths, strict=True)
+    masks = tuple(photo if use else mask for use, photo, mask in pairs)
+    text = f"{plural(sum(own), 'photo')} of {len(own)} masked by alpha"
+    return replace(found, cameras=replace(cameras, mask_paths=masks)).noted("alpha_masks", sum(own), text)
