@@ -20,7 +20,7 @@ from g2ard.io.sanitize import Tally
 from g2ard.io.stream import JoinedClouds, MarkedPoints, PointStream
 from g2ard.io.types import Float32, Note, Notes, Points
 from g2ard.progress import Progress, silent
-from g2ard.scene.attributes import holds, names_in
+from g2ard.scene.conditions import holds, names_in
 from g2ard.scene.splats import Splats
 from g2ard.scene.transform import within_box
 

@@ -20,7 +20,7 @@ from g2ard.io.scene_formats import FORMATS
 from g2ard.jobs.chosen_points import PointChoice
 from g2ard.jobs.inputs import lifted_cloud, load_scene
 from g2ard.progress import Progress, Say, silent, unsaid
-from g2ard.scene.attributes import check_condition, fulfilling
+from g2ard.scene.conditions import check_condition, fulfilling
 from g2ard.scene.splats import Splats
 from g2ard.scene.transform import (
     change_of_axes,
@@ -137,7 +137,7 @@ def convert(
         sphere: centre and radius (x, y, z, r) of what to keep.
         invert: keep what `box` and `sphere` would drop.
         where: condition on the Gaussians to keep, such as "opacity > 0.05 and elongation < 9"; see
-            `g2ard.scene.attributes`. On points it may use the columns of their files: "classification == 2".
+            `g2ard.scene.conditions`. On points it may use the columns of their files: "classification == 2".
         transform: (4, 4) matrix of uniform scale, rotation and translation, row-major.
         scale: factor about the origin.
         rotate: angles about the x, y and z axes in turn, degrees.
