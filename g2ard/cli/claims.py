@@ -137,7 +137,7 @@ class Claims:
         """Splits, points and exposures that are found beside views and photos."""
         from g2ard.io.exposures import exposure_file
         from g2ard.io.splits import split_files
-        from g2ard.jobs.photo_points import sparse_file
+        from g2ard.jobs.start_points import sparse_file
 
         found: set[Path] = {exposure_file(photo) for photo in self._photos}
         for path in filter(may_hold_views, [*self._inputs, *self._cameras]):

@@ -27,9 +27,9 @@ from g2ard.jobs.distill_options import LEAST_RECOVERY_SHARE, DistillOptions
 from g2ard.jobs.doubts import doubts_of_regions, doubts_of_views
 from g2ard.jobs.inputs import GivenViews, Views, axes_of, load_scene, make_targets, scorable, split_views
 from g2ard.jobs.memory import RECOVERY_TIMES, TilePlan
-from g2ard.jobs.photo_colors import colored
-from g2ard.jobs.photo_points import (
-    distinct,
+from g2ard.jobs.run_views import Use, is_untouched, pool_times, views_of, within_pixels
+from g2ard.jobs.simplify import Reduction
+from g2ard.jobs.start_points import (
     is_sparse_file,
     placed_source,
     rough_points,
@@ -38,8 +38,6 @@ from g2ard.jobs.photo_points import (
     topped_up,
     usual_count,
 )
-from g2ard.jobs.run_views import Use, is_untouched, pool_times, views_of, within_pixels
-from g2ard.jobs.simplify import Reduction
 from g2ard.jobs.view_checks import check_photos, propose_background
 from g2ard.jobs.viewer_frame import best_level
 from g2ard.pipeline.config import DistillConfig
@@ -59,6 +57,8 @@ from g2ard.scene.samples import evenly_spaced
 from g2ard.scene.splats import Splats
 from g2ard.stages.evaluate import Evaluation, evaluate
 from g2ard.stages.lift import in_axes, lift, lift_rows
+from g2ard.stages.photo_points.colors import colored
+from g2ard.stages.photo_points.rays import distinct
 from g2ard.stages.recover.anchors import FREE, PriorMeasures, Regularizers, measure_prior, regularizers_for
 from g2ard.stages.recover.config import RecoverConfig, Schedule
 from g2ard.stages.simplify.gaps import say_gaps
@@ -455,9 +455,9 @@ def distill(
     Args:
         scene: the dense scene, a coloured point cloud, or the path of either. None starts from photos alone:
             from COLMAP's sparse points, or as a fallback from points along camera rays
-            (`g2ard.jobs.photo_points`).
+            (`g2ard.stages.photo_points`).
         count: Gaussians of the result, at most those of the scene. Photos alone need no budget: see
-            `g2ard.jobs.photo_points.usual_count`.
+            `g2ard.jobs.start_points.usual_count`.
         ratio: reduction factor, at least 1.
         fit: largest file, such as "5MB", or a device (see `Budget`).
         min_psnr: PSNR (dB) that simplification alone must keep against the scene, in generated views.

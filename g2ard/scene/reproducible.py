@@ -148,6 +148,30 @@ def strata(features: Floats, size: int, seed: int) -> NDArray[Any]:
     return np.concatenate(groups)
 
 
+def merge_equal(points: Floats, colors: NDArray[Any]) -> tuple[NDArray[np.intp], NDArray[Any]]:
+    """Return the first row of each position, ascending, and the mean colour there.
+
+    Positions are equal if their float32 values are, which is all that a scene can hold.
+
+    Args:
+        points: (N, 3) relative to a point amid them.
+    """
+    with np.errstate(over="ignore"):
+        x, y, z = (points.astype(np.float32) + np.float32(0)).T  # -0 is 0
+    order = np.lexsort((z, y, x))
+    new = np.ones(len(points), bool)
+    new[1:] = np.any([axis[order[1:]] != axis[order[:-1]] for axis in (x, y, z)], axis=0)
+    firsts = order[new]
+    if new.all():
+        return np.arange(len(points)), colors
+    number = np.empty(len(firsts), np.intp)
+    number[np.argsort(firsts)] = np.arange(len(firsts))
+    group = np.empty(len(points), np.intp)
+    group[order] = number[np.cumsum(new) - 1]
+    totals = [np.bincount(group, channel) for channel in colors.T]
+    return np.sort(firsts), np.stack(totals, axis=1) / np.bincount(group)[:, None]
+
+
 def canonical_order(splats: Splats, rows: NDArray[Any]) -> NDArray[Any]:
     """Return an order of rows by a hash of opacity, rotation and colour; ties by place and size.
 

@@ -6,7 +6,7 @@ Distil *from* this prior, with photos as targets; rendered as it is, it looks fl
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Annotated, Any, cast
+from typing import Annotated, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -18,7 +18,7 @@ from g2ard.config.schema import Settings
 from g2ard.errors import InputError, require
 from g2ard.poses.site import Site
 from g2ard.progress import Progress, counter, plural, silent
-from g2ard.scene.reproducible import middle
+from g2ard.scene.reproducible import merge_equal, middle
 from g2ard.scene.splats import SH_C0, Splats, unit_colors
 from g2ard.scene.transform import up_in
 
@@ -142,7 +142,7 @@ def lift_rows(
     origin = middle(xyz)
     centered = xyz - origin
     if merge:
-        firsts, rgb = merged(centered, rgb)
+        firsts, rgb = merge_equal(centered, rgb)
         xyz = xyz[firsts]
         centered = centered[firsts]
         rows = rows[firsts]
@@ -172,30 +172,6 @@ def isolated(splats: Splats) -> str | None:
         return None
     text = f"became discs of up to {sizes.max() / usual:,.0f} times the usual size"
     return f"{plural(count, 'isolated point')} {text}; remove strays first, as with CloudCompare's SOR filter"
-
-
-def merged(points: NDArray[np.float64], colors: NDArray[Any]) -> tuple[NDArray[np.intp], NDArray[Any]]:
-    """Return the first row of each position, ascending, and the mean colour there.
-
-    Positions are equal if their float32 values are, which is all that a scene can hold.
-
-    Args:
-        points: (N, 3) relative to a point amid them.
-    """
-    with np.errstate(over="ignore"):
-        x, y, z = (points.astype(np.float32) + np.float32(0)).T  # -0 is 0
-    order = np.lexsort((z, y, x))
-    new = np.ones(len(points), bool)
-    new[1:] = np.any([axis[order[1:]] != axis[order[:-1]] for axis in (x, y, z)], axis=0)
-    firsts = order[new]
-    if new.all():
-        return np.arange(len(points)), colors
-    number = np.empty(len(firsts), np.intp)
-    number[np.argsort(firsts)] = np.arange(len(firsts))
-    group = np.empty(len(points), np.intp)
-    group[order] = number[np.cumsum(new) - 1]
-    totals = [np.bincount(group, channel) for channel in colors.T]
-    return np.sort(firsts), np.stack(totals, axis=1) / np.bincount(group)[:, None]
 
 
 def _anchor(points: NDArray[np.float64]) -> NDArray[np.float64]:

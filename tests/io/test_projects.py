@@ -14,7 +14,7 @@ from g2ard.io.finding import Finder
 from g2ard.io.photos import load_mask, load_photo
 from g2ard.io.types import ViewFiles
 from g2ard.io.views import read_view_set
-from g2ard.jobs.photo_points import sparse_file, sparse_points
+from g2ard.jobs.start_points import sparse_file, sparse_points
 from helpers.view_files import colmap, edit, orbit, photo, transforms
 
 NAMES = [f"photo {i}.png" for i in range(4)]

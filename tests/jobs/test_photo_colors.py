@@ -9,9 +9,9 @@ from PIL import Image
 
 from g2ard.io.types import Points
 from g2ard.jobs.distill import _points
-from g2ard.jobs.photo_colors import colored, median_colors
 from g2ard.progress import unsaid
 from g2ard.scene.cameras import Camera, Cameras
+from g2ard.stages.photo_points.colors import colored, median_colors
 
 
 def view(folder: Path, number: int, colour: tuple[int, int, int], eye: list[float]) -> Camera:

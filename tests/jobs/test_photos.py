@@ -17,8 +17,10 @@ from g2ard.io.types import Points
 from g2ard.jobs.budget import Budget
 from g2ard.jobs.distill import prepare
 from g2ard.jobs.distill_options import DistillOptions
-from g2ard.jobs.photo_points import distinct, points_along_rays, topped_up, usual_count, visual_hull
+from g2ard.jobs.start_points import topped_up, usual_count
 from g2ard.progress import silent, unsaid
+from g2ard.stages.photo_points.hull import visual_hull
+from g2ard.stages.photo_points.rays import distinct, points_along_rays
 from g2ard.stages.recover.config import TUNED
 from helpers.commands import CommandLine, refused, succeeds
 from helpers.photos import photos_of, rgba_photos_of
@@ -208,7 +210,7 @@ def test_no_count_is_above_its_limit_but_for_sparse_points(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     photos_of(tmp_path / "photos")
-    monkeypatch.setattr("g2ard.jobs.photo_points._MOST_USUAL_COUNT", 50)
+    monkeypatch.setattr("g2ard.jobs.start_points._MOST_USUAL_COUNT", 50)
     train = g2ard.load_views(tmp_path / "photos", split="train")
     for sparse, expected in ((0, 50), (70, 70)):
         assert usual_count(train, None, sparse, unsaid) == expected

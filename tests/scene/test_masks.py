@@ -19,13 +19,13 @@ from g2ard.io.exposures import find_exposures
 from g2ard.io.images import write_png
 from g2ard.io.photos import load_mask
 from g2ard.io.types import ViewFiles
-from g2ard.jobs.photo_points import points_along_rays
 from g2ard.rendering.metrics import psnr, ssim
 from g2ard.rendering.renderer import render
 from g2ard.rendering.targets import Photos
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.lenses import PhotoLens
 from g2ard.scene.splats import Splats
+from g2ard.stages.photo_points.rays import points_along_rays
 from g2ard.stages.recover.anchors import Regularizers
 from g2ard.stages.recover.config import RecoverConfig
 from g2ard.stages.recover.optimize import recover

@@ -85,7 +85,7 @@ def _described(given: ViewFiles) -> tuple[dict[str, Any], list[list[str]]]:
     if scene == path:
         figures = describe(given, _overdraw)
         if figures["kind"] == "views":
-            from g2ard.jobs.photo_points import sparse_file, sparse_points
+            from g2ard.jobs.start_points import sparse_file, sparse_points
 
             points = sparse_points(sparse_file(path), partial(_noted, figures))
             figures["sparse_points"] = 0 if points is None else len(points)

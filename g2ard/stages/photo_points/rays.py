@@ -1,163 +1,25 @@
-"""Starting points from photos with poses: COLMAP's sparse points, and as a fallback points along camera rays.
+"""Points along camera rays, each at the depth where photos of nearby views agree best on its colour.
 
-A point along a camera ray lies on the ray of a random pixel, at the depth where photos of nearby views agree
-best on its colour (a plane sweep, one ray at a time), and within the visual hull of photos with alpha. The
-points are a start for distillation, not a reconstruction.
+A plane sweep, one ray of a random pixel at a time, within the visual hull of photos with alpha. The points
+are a start for distillation, not a reconstruction.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from g2ard.config.choices import BLACK, Colour
-from g2ard.errors import G2ardError, InputError
-from g2ard.io import Source, read_cloud
-from g2ard.io.detect import file_format
-from g2ard.io.finding import Finder
-from g2ard.io.jsonfile import read_json
-from g2ard.io.paths import real_path
+from g2ard.errors import InputError
 from g2ard.io.photos import composited, load_photo
-from g2ard.io.stream import PointStream
-from g2ard.io.types import Cloud, Points, ViewFiles
-from g2ard.jobs.inputs import Views
-from g2ard.progress import Progress, Say, plural, silent, unsaid
+from g2ard.io.types import Points
+from g2ard.progress import Progress, plural, silent
 from g2ard.scene.cameras import Cameras
-from g2ard.scene.samples import evenly_spaced
-from g2ard.stages.lift import merged
+from g2ard.scene.reproducible import merge_equal
+from g2ard.stages.photo_points.hull import Float, Mask, VisualHull, grown, visual_hull
 
-_COARSE_VOXELS = 64
-"""Voxels per side of the grid that finds the object's box."""
-_FINE_VOXELS = 128
-"""Voxels per side of the grid within that box."""
-_EMPTY_VIEWS_SHARE = 0.02
-"""Share of the views that may see a voxel as empty, because single outlines have errors."""
-_SEEING_VIEWS_SHARE = 0.25
-"""Least share of the views that must contain a voxel."""
-
-Float = NDArray[np.float64]
-Mask = NDArray[np.bool_]
-
-
-@dataclass(frozen=True, eq=False)
-class VisualHull:
-    """A grid of voxels.
-
-    Args:
-        low: (3,) corner of the grid, world units.
-        side: (3,) sides of a voxel.
-        filled: (X, Y, Z), whether a voxel may be occupied.
-    """
-
-    low: Float
-    side: Float
-    filled: Mask
-
-    def holds(self, points: Float) -> Mask:
-        """Return whether (…, 3) world points lie in filled voxels."""
-        at = np.floor((points - self.low) / self.side).astype(np.int64)
-        inside: Mask = np.all((at >= 0) & (at < self.filled.shape), axis=-1)
-        x, y, z = np.moveaxis(np.where(inside[..., None], at, 0), -1, 0)
-        inside_hull: Mask = inside & self.filled[x, y, z]
-        return inside_hull
-
-    def depths(self, cameras: Cameras, view: int, count: int) -> Float:
-        """Return (count,) depths that cover the grid's box in a view, evenly spaced."""
-        corners = self.low + np.indices((2, 2, 2)).reshape(3, 8).T * self.side * self.filled.shape
-        depth = corners @ cameras.viewmats[view, 2, :3] + cameras.viewmats[view, 2, 3]
-        return np.linspace(max(depth.min(), 1e-3 * depth.max()), depth.max(), count)
-
-
-def visual_hull(cameras: Cameras, outlines: Sequence[Mask | None], middle: Float) -> VisualHull | None:
-    """Carve away every voxel that photos show to be empty.
-
-    Args:
-        outlines: (H, W) pixels that show the object, per view; None for a view that does not say.
-        middle: (3,) a point that the cameras look at.
-
-    Returns None if nothing remains, or the object is not outlined in enough views.
-    """
-    told = [v for v, outline in enumerate(outlines) if outline is not None and not bool(outline.all())]
-    if len(told) < max(3, _SEEING_VIEWS_SHARE * len(cameras)):
-        return None
-    half = float(np.median(np.linalg.norm(cameras.positions - middle, axis=1)))
-    told = np.random.default_rng(0).permutation(told).tolist()  # other directions carve sooner
-    low, size = middle - half, np.full(3, 2 * half)
-    for count in (_COARSE_VOXELS, _FINE_VOXELS):
-        side = size / count
-        middle = low + size / 2
-        views = [_outlined(cameras, view, outlines[view], middle, side) for view in told]
-        filled = _carved(views, low, side, count)
-        if not filled.any():
-            return None
-        occupied = np.argwhere(filled)
-        hull = VisualHull(low, side, filled)
-        low, size = low + (occupied.min(0) - 1) * side, (np.ptp(occupied, 0) + 3) * side
-    return hull
-
-
-def _outlined(
-    cameras: Cameras, view: int, outline: Mask | None, middle: Float, side: Float
-) -> tuple[Float, Mask]:
-    """Return a view's (3, 4) projection to pixels, and the pixels that a voxel touching the object may have:
-    the outline, grown by half the diagonal of a voxel."""
-    assert outline is not None
-    projection = cameras.Ks[view] @ cameras.viewmats[view, :3]
-    depth = float(projection[2, :3] @ middle + projection[2, 3])
-    radius = 0.5 * float(np.linalg.norm(side)) * cameras.Ks[view, 0, 0] / max(depth, side.max())
-    return projection, grown(outline, int(np.ceil(radius)))
-
-
-def _carved(views: Sequence[tuple[Float, Mask]], low: Float, side: Float, count: int) -> Mask:
-    """Return the (count, count, count) voxels that are in sight and within the outlines."""
-    steps = np.arange(count) + 0.5
-    filled = np.zeros((count, count * count), bool)
-    plane = np.stack(np.meshgrid(steps, steps, indexing="ij"), -1).reshape(-1, 2) * side[1:] + low[1:]
-    for slab, x in enumerate(low[0] + steps * side[0]):
-        points, left = plane, np.arange(len(plane))
-        empty, seen = np.zeros(len(plane), np.int16), np.zeros(len(plane), np.int16)
-        for P, shown in views:
-            ahead = points @ P[:, 1:3].T + (P[:, 0] * x + P[:, 3])
-            depth = np.maximum(ahead[:, 2], 1e-9)
-            u, v = (ahead[:, :2] / depth[:, None]).T
-            inside = (ahead[:, 2] > 0) & (u >= 0) & (v >= 0) & (u < shown.shape[1]) & (v < shown.shape[0])
-            hit = shown[np.where(inside, v, 0).astype(np.intp), np.where(inside, u, 0).astype(np.intp)]
-            seen += inside
-            empty += inside & ~hit
-            kept = empty <= _EMPTY_VIEWS_SHARE * len(views)
-            if not kept.all():
-                points, left, empty, seen = points[kept], left[kept], empty[kept], seen[kept]
-        filled[slab, left] = seen >= _SEEING_VIEWS_SHARE * len(views)
-    return filled.reshape(count, count, count)
-
-
-def grown(mask: Mask, radius: int) -> Mask:
-    """Return the pixels within `radius` of a mask's, along both axes.
-
-    >>> grown(np.eye(4, dtype=bool)[:2], 1).astype(int).tolist()
-    [[1, 1, 1, 0], [1, 1, 1, 0]]
-    """
-    for axis in (0, 1):
-        pad = [(radius + 1, radius) if k == axis else (0, 0) for k in range(2)]
-        sums = np.cumsum(np.pad(mask, pad).astype(np.int32), axis=axis)
-        span = 2 * radius + 1
-        first = np.arange(mask.shape[axis])
-        mask = sums.take(first + span, axis) > sums.take(first, axis)
-    return mask
-
-
-_PIXELS_PER_GAUSSIAN = 100
-"""Pixels per Gaussian, if no count is given."""
-_MOST_USUAL_COUNT = 100_000
-"""Most Gaussians, if no count is given."""
-_SAMPLED_PHOTOS = 16
-"""Photos that are looked at, if no count is given."""
-_PHOTO_SIDE = 240
-"""Longer side in pixels of the photos used to place points."""
 _TRIAL_DEPTHS = 48
 _HULL_DEPTHS = 96
 """Trial depths across a visual hull."""
@@ -191,152 +53,14 @@ _RAYS = 2048
 """Rays at a time."""
 
 
-def topped_up(
-    points: Points | None,
-    train: Cameras,
-    count: int,
-    *,
-    background: Colour,
-    seed: int,
-    progress: Progress,
-    say: Say,
-) -> Points:
-    """Add points along the camera rays of training views until there are `count`."""
-    sparse = 0 if points is None else len(points)
-    parts = [] if points is None else [points]
-    told = [plural(sparse, "sparse point")] if sparse else []
-    if (missing := count - sparse) > 0:
-        small = train.fitted(_PHOTO_SIDE)
-        parts.append(points_along_rays(small, missing, background=background, seed=seed, progress=progress))
-        told.append(f"{plural(missing, 'point')} along camera rays")
-    say(f"starting from {' and '.join(told)}")
-    return Points(
-        np.concatenate([part.positions for part in parts]), np.concatenate([part.colors for part in parts])
-    )
-
-
-def rough_points(points: Points | None, train: Cameras, count: int) -> Points:
-    """Return `count` points for a dry run: those given, and others anywhere among the cameras."""
-    own = points or Points(np.zeros((0, 3)), np.zeros((0, 3), np.float32))
-    missing = max(0, count - len(own))
-    places = train.positions if not len(own) else own.positions
-    low, high = places.min(axis=0), places.max(axis=0)
-    others = np.random.default_rng(0).uniform(low, high + np.ptp(places), (missing, 3))
-    shades = np.full((missing, 3), 0.5, np.float32)
-    return Points(np.concatenate([own.positions, others]), np.concatenate([own.colors, shades]))
-
-
-def usual_count(train: Cameras, size: int | None, sparse: int, say: Say) -> int:
-    """Return the Gaussians of a scene that starts from photos alone, to two digits, and say so.
-
-    A Gaussian of SH degree 3 has 59 numbers, as many as 20 pixels. One per 100 pixels of the training photos
-    has five times as many equations as unknowns. There are at most 100,000, which take about ten minutes on
-    two cores, or as many as sparse points.
-
-    Args:
-        train: training views.
-        size: longer side of the photos in pixels, if they are larger.
-    """
-    cameras, small = train.resized(size), train.resized(_PHOTO_SIDE)
-    shares = [_shown_share(small, view) for view in evenly_spaced(len(small), _SAMPLED_PHOTOS)]
-    pixels = float((cameras.widths.astype(np.int64) * cameras.heights).sum()) * float(np.mean(shares))
-    most = max(_MOST_USUAL_COUNT, sparse)
-    found = max(1, int(float(f"{min(pixels / _PIXELS_PER_GAUSSIAN, most):.2g}")))
-    photos = plural(len(cameras), "photo")
-    say(f"{plural(found, 'Gaussian')}, one per {pixels / found:.0f} pixels of {photos}; a count changes it")
-    return found
-
-
-def _shown_share(cameras: Cameras, view: int) -> float:
-    """Return the share of a view's pixels that show something; 1 without a photo."""
-    if cameras.image_paths[view] is None:
-        return 1.0
-    image, mask = load_photo(cameras, view, None)
-    shown = image[..., 3] > 0.5 if image.shape[2] == 4 else np.ones(image.shape[:2], bool)
-    return float((shown if mask is None else shown & mask).mean())
-
-
 def distinct(points: Points) -> Points:
     """Merge points of one position, as lifting does, so that what is missing can be counted."""
     if not len(points):
         return points
-    rows, colors = merged(points.positions - np.median(points.positions, axis=0), points.colors)
+    rows, colors = merge_equal(points.positions - np.median(points.positions, axis=0), points.colors)
     if len(rows) == len(points):
         return points
     return Points(points.positions[rows], np.ascontiguousarray(colors, np.float32))
-
-
-def placed_by(train: Cameras, file: Path) -> Cloud:
-    """Read the points of `sparse_file` that training views see, as far as the file states who does."""
-    return placed_source(Source(file), train).cloud(bare=True).whole()
-
-
-def placed_source(scene: Source, train: Cameras) -> Source:
-    """Return points without those that the file says fewer than two training views see."""
-    if scene.format != "points3d":
-        return scene
-    import g2ard.io.points3d as points3d
-
-    placed, chosen = Source(scene.path), scene.through
-
-    def through(stream: PointStream) -> PointStream:
-        seen = points3d.Stream(stream.path, train.names)
-        return chosen(seen) if chosen else seen
-
-    placed.through = through
-    return placed
-
-
-def is_sparse_file(scene: Source, views: Views) -> bool:
-    """Return whether points are those of `sparse_file`."""
-    file = sparse_file(views)
-    given = (scene.kind == "views" and sparse_file(scene.path)) or scene.path
-    return file is not None and real_path(given) == real_path(file)
-
-
-def sparse_points(file: Path | None, say: Say = unsaid, train: Cameras | None = None) -> Cloud | None:
-    """Read the points of `sparse_file`; return None, and say why, if no point is readable.
-
-    With training views, points that these do not see are skipped.
-    """
-    try:
-        if file is None:
-            return None
-        cloud = read_cloud(file, bare=True) if train is None else placed_by(train, file)
-    except G2ardError as error:
-        say(f"warning: no starting points from photos: {error}")
-        return None
-    if len(cloud.points):
-        return cloud
-    say(f"warning: no starting points from photos: {file}: has no points")
-    return None
-
-
-def sparse_file(views: Views) -> Path | None:
-    """Return the file of points of a COLMAP model, of a gsplat run's, of a transforms.json's `ply_file_path`,
-    or the input.ply beside INRIA's cameras.json, which may not exist; None for other views."""
-    import g2ard.io.colmap as colmap
-    import g2ard.io.gsplat_run as gsplat_run
-    import g2ard.io.transforms as transforms
-
-    given = views.path if isinstance(views, ViewFiles) else views
-    if not isinstance(given, str | Path):
-        return None
-    path = Path(given)
-    found, folder = file_format(path), path if path.is_dir() else path.parent
-    if found == "colmap":
-        return colmap.points_file(path)
-    if found == "gsplat_run":
-        data = gsplat_run.data_of(path)
-        return data and colmap.points_file(data)
-    if found == "inria":
-        input_file = folder / "input.ply"
-        return input_file if input_file.is_file() else None
-    if found != "transforms":
-        return None
-    file = path if path.is_file() else next(iter(transforms.files_of(path)))
-    listed = read_json(file).get("ply_file_path")
-    return Finder(file.parent).photo(str(listed)) if listed else None
 
 
 def points_along_rays(
