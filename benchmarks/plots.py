@@ -9,7 +9,7 @@ import csv
 from collections.abc import Iterable
 from pathlib import Path
 
-from g2ard.report.charts import Point, chart
+from g2ard.report.charts import Point, draw_chart
 
 ROOT = Path(__file__).resolve().parent.parent
 RECORD = ROOT / "benchmarks" / "record"
@@ -55,7 +55,7 @@ def lead(kind: str) -> str:
         if method == "default" and peers:
             points.append(Point(ratio, value - max(peers), scenes.index(scene), text=scene))
     label = f"dB over the better peer, {kind} views"
-    return standalone(chart(points, x_label="ratio", y_label=label, log=True, joined=True), scenes)
+    return standalone(draw_chart(points, x_label="ratio", y_label=label, log=True, joined=True), scenes)
 
 
 def curve(scene: str, variants: tuple[str, ...]) -> str:
@@ -72,7 +72,7 @@ def curve(scene: str, variants: tuple[str, ...]) -> str:
         Point(float(r["seconds"]), float(r["psnr"]), variants.index(r["variant"]), text=f"{r['step']} steps")
         for r in recorded
     ]
-    drawn = chart(points, x_label="seconds of recovery", y_label="PSNR, dB", log=True, joined=True)
+    drawn = draw_chart(points, x_label="seconds of recovery", y_label="PSNR, dB", log=True, joined=True)
     return standalone(drawn, variants)
 
 
@@ -85,7 +85,7 @@ def frontier() -> str:
         if row["views_kind"] == "pool" and (name := f"{row['scene']}: {whose}") in names:
             at = Point(float(row["cpu_s"]), float(row["psnr"]), names.index(name), text=row["method"])
             points.append(at)
-    drawn = chart(points, x_label="CPU seconds", y_label="PSNR, dB", log=True, joined=True)
+    drawn = draw_chart(points, x_label="CPU seconds", y_label="PSNR, dB", log=True, joined=True)
     return standalone(drawn, names)
 
 
@@ -98,7 +98,7 @@ def sizes() -> str:
         if row["views_kind"] == "pool" and row["method"] in methods:
             name = f"{row['scene']}: {methods[row['method']]}"
             points.append(Point(float(row["scale"]), float(row["psnr"]), names.index(name), text=name))
-    drawn = chart(points, x_label="size of views / 800 px", y_label="PSNR, dB", log=True, joined=True)
+    drawn = draw_chart(points, x_label="size of views / 800 px", y_label="PSNR, dB", log=True, joined=True)
     return standalone(drawn, names)
 
 

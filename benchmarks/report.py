@@ -16,7 +16,7 @@ from benchmarks.process import machine
 from benchmarks.rows import Row, shown
 from benchmarks.study import Study
 from g2ard import __version__
-from g2ard.report.charts import COLORS, STYLE, Point, chart, legend, pareto, side_by_side
+from g2ard.report.charts import COLORS, STYLE, Point, draw_chart, draw_legend, find_front, place_side_by_side
 from g2ard.report.page import Page, Shown
 
 __all__ = ["write_report"]
@@ -56,7 +56,7 @@ def _study(page: Page, folder: Path, study: Study, rows: list[Row]) -> None:
         page.html(f"<ul>{''.join(f'<li>{escape(line)}</li>' for line in study.differs)}</ul>")
     names = list(dict.fromkeys(map(_name, rows)))
     matched = {row.get("matched") for row in rows}
-    page.html(legend(names, [f"{mark} {kind}" for kind, mark in _MARKS.items() if kind in matched]))
+    page.html(draw_legend(names, [f"{mark} {kind}" for kind, mark in _MARKS.items() if kind in matched]))
     for line in dict.fromkeys(line for row in rows for line in _notes(row)):
         page.paragraph(line)
     summary = study.summary(rows)
@@ -73,7 +73,7 @@ def _study(page: Page, folder: Path, study: Study, rows: list[Row]) -> None:
         views = f": {group[0]['views']} {split} views" if "views" in group[0] else ""
         page.heading(f"{scene}{views}{f' against {against}' if against else ''}", 3)
         if "psnr" in group[0]:
-            page.html(side_by_side(_charts(group, names)))
+            page.html(place_side_by_side(_charts(group, names)))
         for line in _over_seeds(group):
             page.paragraph(line)
         columns, cells = shown(row for row in group if row.get("final", 1))
@@ -113,9 +113,9 @@ def _charts(rows: Sequence[Row], names: Sequence[str]) -> list[tuple[str, str]]:
     rows = [row for row in rows if row.get("matched") != "none"]
     for ratio in sorted({row.get("ratio", 0.0) for row in rows}):
         points = [_point(row, row.get("cpu_s", 0.0), names) for row in rows if row.get("ratio", 0.0) == ratio]
-        best = {id(point) for point in pareto(points)}
+        best = {id(point) for point in find_front(points)}
         points = [Point(p.x, p.y, p.series, p.mark, p.text, p.label if id(p) in best else "") for p in points]
-        svg = chart(points, x_label="CPU seconds", y_label="PSNR, dB", log=True, front=True)
+        svg = draw_chart(points, x_label="CPU seconds", y_label="PSNR, dB", log=True, front=True)
         charts.append((f"{ratio:g}×: error against time; dashed: the Pareto front", svg))
     if len({row.get("ratio") for row in rows}) > 1:
         for matched in dict.fromkeys((row.get("matched", ""), row.get("amount", 0.0)) for row in rows):
@@ -125,7 +125,7 @@ def _charts(rows: Sequence[Row], names: Sequence[str]) -> list[tuple[str, str]]:
                 if (row.get("matched", ""), row.get("amount", 0.0)) == matched
                 and row.get("seed") == rows[0].get("seed")
             ]
-            svg = chart(points, x_label="Gaussians", y_label="PSNR, dB", log=True, joined=True)
+            svg = draw_chart(points, x_label="Gaussians", y_label="PSNR, dB", log=True, joined=True)
             charts.append((f"Error against count {matched[0]} {matched[1] or ''}", svg))
     return charts
 

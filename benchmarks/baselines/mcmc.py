@@ -24,7 +24,7 @@ from g2ard.scene.cameras import Cameras
 from g2ard.scene.samples import evenly_spaced
 from g2ard.scene.splats import Splats
 from g2ard.scene.transform import transform
-from g2ard.stages.recover.loop import drawn
+from g2ard.stages.recover.loop import draw_views
 from g2ard.stages.recover.optimize import Watch
 
 if TYPE_CHECKING:
@@ -115,7 +115,7 @@ def train(
     for step in range(steps):
         epoch, turn = divmod(step, len(views))
         if turn == 0:
-            order = drawn(seed, epoch, len(views))
+            order = draw_views(seed, epoch, len(views))
         view = int(order[turn])
         training.step(step, view, *views[view], background)
         if watch is not None and (step + 1) % _WATCHED == 0:

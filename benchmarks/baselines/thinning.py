@@ -19,7 +19,7 @@ from g2ard.rendering.renderer import RasterSettings
 from g2ard.rendering.targets import Targets
 from g2ard.scene.splats import Splats
 from g2ard.scene.transform import transform
-from g2ard.stages.recover.loop import drawn
+from g2ard.stages.recover.loop import draw_views
 from g2ard.stages.recover.losses import l1_ssim
 from g2ard.stages.recover.optimize import Watch
 from g2ard.stages.recover.rasterize import rasterize
@@ -73,7 +73,7 @@ class Training:
         spent, now = 0.0, time.monotonic()
         for step in range(1, self.steps + 1):
             epoch, turn = divmod(step - 1, len(self.views))
-            view = int(drawn(self.seed, epoch, len(self.views))[turn])
+            view = int(draw_views(self.seed, epoch, len(self.views))[turn])
             rate = mcmc._RATES["means"] * mcmc._EXTENT * 0.01 ** (step / self.steps)
             self._optimizers["means"].param_groups[0]["lr"] = rate
             loss: Any = self.loss(view, self.rendered(view)) + strategy.penalty(self)

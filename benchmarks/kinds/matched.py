@@ -39,7 +39,7 @@ from g2ard.rendering.targets import Targets
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.shape import needle_share
 from g2ard.scene.splats import Splats
-from g2ard.stages.recover.anchors import REGULARIZERS, regularizers_for
+from g2ard.stages.recover.anchors import REGULARIZERS, choose_regularizers
 from g2ard.stages.simplify import round_counts
 
 __all__ = ["Matched", "MatchedWorkspace"]
@@ -443,7 +443,7 @@ class _Pipeline:
         method = self.method
         papers = method.lambdas == "paper"
         known = {"given": self.place.scene.regularizers}.get(self.prior, self.prior) if papers else "auto"
-        chosen, _, _ = regularizers_for(
+        chosen, _, _ = choose_regularizers(
             known if method.preset == "auto" else method.preset, prior, paper=papers
         )
         return asdict(replace(chosen, **method.regularizers))

@@ -25,7 +25,7 @@ from g2ard.rendering.targets import Targets
 from g2ard.rendering.visibility import visibility_source
 from g2ard.scene.shape import effective_rank, needle_share
 from g2ard.scene.splats import Splats
-from g2ard.stages.recover.anchors import Anchors, drift95, regularizers_for
+from g2ard.stages.recover.anchors import Anchors, choose_regularizers, drift95
 from g2ard.stages.recover.optimize import recover
 from g2ard.stages.recover.report import RecoverReport
 from g2ard.stages.simplify import simplify
@@ -159,7 +159,7 @@ class _Workspace(Workspace):
         preset = variant.preset or "auto"
         given = {**PRESETS[preset], **variant.settings}
         views = self.train_cameras if self.scene.targets == "photos" else None
-        weights, _, _ = regularizers_for(given.get("recover.regularizers", "auto"), self.splats, views)
+        weights, _, _ = choose_regularizers(given.get("recover.regularizers", "auto"), self.splats, views)
         values = {
             **variant.settings,
             "recover.engine": self.study.engine,

@@ -27,7 +27,7 @@ COMMANDS = {
 """Command → its line in `g2ard --help`, in that order; each is a module of `g2ard.cli.commands`."""
 
 
-def _version(show: bool) -> None:
+def _print_version(show: bool) -> None:
     if show:
         from g2ard._core import __version__
 
@@ -37,13 +37,14 @@ def _version(show: bool) -> None:
 
 def _root(
     version: Annotated[
-        bool, typer.Option("-V", "--version", callback=_version, is_eager=True, help="Print the version.")
+        bool,
+        typer.Option("-V", "--version", callback=_print_version, is_eager=True, help="Print the version."),
     ] = False,
 ) -> None:
     pass
 
 
-def _made() -> typer.Typer:
+def _create_app() -> typer.Typer:
     """Create an application without commands."""
     made = typer.Typer(
         help="Distil dense 3D Gaussian scenes into compact, standard 3DGS scenes of an exact size.",
@@ -56,18 +57,18 @@ def _made() -> typer.Typer:
     return made
 
 
-app = _made()
+app = _create_app()
 
 
-def listing() -> typer.Typer:
+def create_listing() -> typer.Typer:
     """Create an application that only lists the commands, for `g2ard --help`."""
-    made = _made()
+    made = _create_app()
     for name, line in COMMANDS.items():
-        made.command(name, help=line)(_listed)
+        made.command(name, help=line)(_do_nothing)
     return made
 
 
-def _listed() -> None:
+def _do_nothing() -> None:
     """Stand for a command that is only listed."""
 
 

@@ -21,17 +21,17 @@ import typer
 
 from g2ard.cli.app import app
 from g2ard.cli.budget_options import BUDGETS, SEVERAL, TILES
-from g2ard.cli.config_file import load_config, printed
+from g2ard.cli.config_file import load_config, write_config
 from g2ard.cli.fields import FIELDS
 from g2ard.cli.panels import Command, in_panel, ordered
 from g2ard.cli.run import Run
-from g2ard.cli.usage import flags_of, in_flags, typed
+from g2ard.cli.usage import is_typed, map_flags, spell_in_flags
 from g2ard.config.choices import PointColor, RenderModel
 from g2ard.errors import G2ardError
 from g2ard.progress import plural
 from g2ard.system import devices, interrupt
 
-__all__ = ["app", "command", "one_line"]
+__all__ = ["app", "command", "describe_error"]
 
 
 _EXCLUSIVE_OPTIONS = (
@@ -43,11 +43,11 @@ _EXCLUSIVE_OPTIONS = (
 """Options that exclude each other."""
 
 
-def _flags_win(ctx: typer.Context, values: dict[str, Any], defaults: dict[str, Any]) -> None:
+def _prefer_flags(ctx: typer.Context, values: dict[str, Any], defaults: dict[str, Any]) -> None:
     """Let typed flags override options of the config file that they exclude."""
     for pair in _EXCLUSIVE_OPTIONS:
         for flag, other in (pair, pair[::-1]):
-            if typed(ctx, flag) and not typed(ctx, other) and other in defaults:
+            if is_typed(ctx, flag) and not is_typed(ctx, other) and other in defaults:
                 values[other] = defaults[other]
 
 
@@ -133,9 +133,9 @@ def command(
             takes no --set.
         fields: paths of its settings that flags set: those of `FIELDS`, or options named like them.
         scenes: whether it reads scenes and takes --render-model, see `Run.load`.
-        budgets: whether it takes a budget, see `g2ard.cli.outputs.budget_of`.
-        several: whether it takes several, see `g2ard.cli.outputs.budgets_of`.
-        tiles: whether it works on scenes in tiles, see `g2ard.cli.work_folder.tiling_of`.
+        budgets: whether it takes a budget, see `g2ard.cli.outputs.read_budget`.
+        several: whether it takes several, see `g2ard.cli.outputs.read_budgets`.
+        tiles: whether it works on scenes in tiles, see `g2ard.cli.work_folder.read_tiling`.
         points: whether it takes point clouds, of which `g2ard.cli.options.choose_points` chooses points.
         outputs: parameters that are paths to write, all of which it passes to `Run.claim`.
         without: common options that have no effect on it.
@@ -158,24 +158,27 @@ def command(
         shared_options |= {} if settings is None else _SETTINGS
         shared_options |= _SCENE_OPTIONS if scenes else {}
         shared_options |= _POINT_OPTIONS if points else {}
-        all_parameters = [*own, *(_parameter(key, *options) for key, options in shared_options.items())]
+        all_parameters = [
+            *own,
+            *(_create_parameter(key, *options) for key, options in shared_options.items()),
+        ]
         if parent is app:
             all_parameters = [in_panel(name, p) for p in ordered(name, all_parameters)]
 
         def call(ctx: typer.Context, **values: Any) -> None:
-            _flags_win(ctx, values, {p.name: p.default for p in all_parameters})
+            _prefer_flags(ctx, values, {p.name: p.default for p in all_parameters})
             shared_values = {key: values.pop(key) for key in shared_options}
             shared_values |= {key: _COMMON_OPTIONS[key][2] for key in without}
-            if typed(ctx, "set"):  # after the config file's, since the last value wins
+            if is_typed(ctx, "set"):  # after the config file's, since the last value wins
                 typed_last = [*(ctx.default_map or {}).get("set", []), *shared_values["set"]]
                 shared_values["set"] = typed_last
             printing = shared_values.pop("print_config")
-            run = Run(name, shared_values, dict(values), flags_of(ctx.command), outputs, fields)
-            run.typed = frozenset(name for name in values if typed(ctx, name))
+            run = Run(name, shared_values, dict(values), map_flags(ctx.command), outputs, fields)
+            run.typed = frozenset(name for name in values if is_typed(ctx, name))
             if printing:
                 if settings and run.config["set"]:
                     run.settled(resolve_name(settings)(), run.config.get("preset"))
-                typer.echo(printed(ctx, {**values, **shared_values, **run.config}), nl=False)
+                typer.echo(write_config(ctx, {**values, **shared_values, **run.config}), nl=False)
                 return
             with interrupt.RaisesInterrupt():
                 _execute(run, fn, values)
@@ -192,7 +195,7 @@ def command(
     return register
 
 
-def _parameter(name: str, kind: Any, option: Any, default: Any = None) -> inspect.Parameter:
+def _create_parameter(name: str, kind: Any, option: Any, default: Any = None) -> inspect.Parameter:
     annotation = Annotated[kind, option]
     return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
 
@@ -208,19 +211,19 @@ def _execute(run: Run, fn: Callable[..., None], options: dict[str, Any]) -> None
 
             _core.set_num_threads(run.threads)
             os.environ["RAYON_NUM_THREADS"] = str(run.threads)  # for child processes
-        with run.console, _device(run):
+        with run.console, _use_device(run):
             fn(run, **options)
         run.end()
     except KeyboardInterrupt:
-        _stopped(run)
+        _exit_interrupted(run)
     except (G2ardError, OSError, MemoryError) as e:
-        run.console.error(run.failure(one_line(e, run.flags)))
+        run.console.error(run.failure(describe_error(e, run.flags)))
         raise typer.Exit(1) from None
     except (typer.Exit, typer.BadParameter):
         raise
     except Exception as e:
         if isinstance(e.__cause__, KeyboardInterrupt):  # before Python 3.12, in `__set_name__`
-            _stopped(run)
+            _exit_interrupted(run)
         if run.verbose:
             traceback.print_exc()
         reason = run.failure(f"{type(e).__name__}: {' '.join(str(e).split())}")
@@ -228,13 +231,13 @@ def _execute(run: Run, fn: Callable[..., None], options: dict[str, Any]) -> None
         raise typer.Exit(1) from None
 
 
-def _stopped(run: Run) -> NoReturn:
+def _exit_interrupted(run: Run) -> NoReturn:
     run.console.error(f"interrupted; {'; '.join(run.kept) or 'nothing was written'}")
     raise typer.Exit(interrupt.status()) from None
 
 
 @contextmanager
-def _device(run: Run) -> Iterator[None]:
+def _use_device(run: Run) -> Iterator[None]:
     """Run kernels on --device, and report GPU use at the end."""
     if run.device not in ("auto", "gpu"):
         yield
@@ -256,10 +259,10 @@ def _device(run: Run) -> Iterator[None]:
             run.say(f"GPU: {plural(state.served, 'kernel')} on {state.adapter}{took}")
 
 
-def one_line(error: BaseException, flags: Mapping[str, str]) -> str:
+def describe_error(error: BaseException, flags: Mapping[str, str]) -> str:
     """Return the line that the command line prints for an error."""
     if isinstance(error, G2ardError):
-        return " ".join(in_flags(error, flags).split())
+        return " ".join(spell_in_flags(error, flags).split())
     if isinstance(error, OSError) and error.filename is not None and error.strerror:
         return f"{error.filename}: {error.strerror}"
     if isinstance(error, MemoryError):

@@ -11,7 +11,7 @@ from typing import Any
 import typer
 
 from g2ard.cli.budget_options import Count
-from g2ard.cli.usage import meant
+from g2ard.cli.usage import suggest_names
 from g2ard.errors import InputError
 
 _NOT_KEPT = ("config", "print_config", "overwrite", "resume")
@@ -29,32 +29,32 @@ def load_config(ctx: typer.Context, path: Path | None) -> Path | None:
     """
     if path is None:
         return None
-    values = _read(path)
+    values = _read_toml(path)
     name = str(ctx.info_name)
     tables = {key: value for key, value in values.items() if isinstance(value, dict) and key != "set"}
     top = {key: value for key, value in values.items() if key not in tables}
-    commands = _parameters(ctx, path, tables)
+    commands = _find_parameters(ctx, path, tables)
     for other, table in tables.items():
         _check_keys(table, commands[other], f"{path}: `{other}` has no option")
     anywhere = {flag: p for parameters in commands.values() for flag, p in parameters.items()}
     missing = "none of its commands has an option" if tables else f"`{name}` has no option"
     _check_keys(top, anywhere, f"{path}: {missing}")
     own = tables.get(name, {})
-    settings = _flat(top.pop("set", {})) | _flat(own.pop("set", {}))
+    settings = _flatten(top.pop("set", {})) | _flatten(own.pop("set", {}))
     if settings and "set" not in commands[name]:
         raise typer.BadParameter(f"{path}: `{name}` has no settings; remove `set`")
     found: dict[str, Any] = {}
     for key, value in {**top, **own}.items():
-        parameter = commands[name].get(_dashed(key))
+        parameter = commands[name].get(_write_dashes(key))
         if parameter is not None:  # otherwise an option of another command
-            found[str(parameter.name)] = _default(parameter, value)
+            found[str(parameter.name)] = _read_default(parameter, value)
     if settings:
-        found["set"] = [f"{key}={_as_typed(value)}" for key, value in settings.items()]
+        found["set"] = [f"{key}={_write_as_typed(value)}" for key, value in settings.items()]
     ctx.default_map = {**(ctx.default_map or {}), **found}
     return path
 
 
-def _read(path: Path) -> dict[str, Any]:
+def _read_toml(path: Path) -> dict[str, Any]:
     import tomllib
 
     from g2ard.io.paths import read_text
@@ -69,20 +69,20 @@ def _read(path: Path) -> dict[str, Any]:
         raise typer.BadParameter(f"{path}: {e}{hint}") from None
 
 
-def _parameters(ctx: typer.Context, path: Path, tables: Iterable[str]) -> dict[str, dict[str, Any]]:
+def _find_parameters(ctx: typer.Context, path: Path, tables: Iterable[str]) -> dict[str, dict[str, Any]]:
     """Return the parameters of this command and of those with a table, by command and dashed name."""
     from g2ard.cli.app import COMMANDS, app, register_commands
 
     name = str(ctx.info_name)
     others = set(tables) - {name}
     if strange := others - {*COMMANDS}:
-        raise typer.BadParameter(f"{path}: unknown command {meant(strange, {*COMMANDS, name})}")
+        raise typer.BadParameter(f"{path}: unknown command {suggest_names(strange, {*COMMANDS, name})}")
     for other in others:
         register_commands(other)
     commands: dict[str, Any] = getattr(typer.main.get_command(app), "commands", {}) if others else {}
     taken = {other: commands[other] for other in others} | {name: ctx.command}
     return {
-        command: {_dashed(flag.lstrip("-")): p for p in found.params for flag in (*p.opts, str(p.name))}
+        command: {_write_dashes(flag.lstrip("-")): p for p in found.params for flag in (*p.opts, str(p.name))}
         for command, found in taken.items()
     }
 
@@ -92,33 +92,33 @@ def _check_keys(table: dict[str, Any], known: dict[str, Any], problem: str) -> N
     told = []
     long = [flag for flag in known if len(flag) > 1]
     for key in sorted(table):
-        name = key if len(key) > 1 or key not in known else _long_name(known[key])
+        name = key if len(key) > 1 or key not in known else _find_long_name(known[key])
         if name != key:
             told.append(f"{key} (write {name})")
-        elif _dashed(key) not in known and key != "set":
-            told.append(meant([key], long))
+        elif _write_dashes(key) not in known and key != "set":
+            told.append(suggest_names([key], long))
     if told:
         raise typer.BadParameter(f"{problem} {', '.join(told)}")
 
 
-def _default(parameter: Any, value: Any) -> Any:
+def _read_default(parameter: Any, value: Any) -> Any:
     """Return a TOML value as a parameter's default: as typed, in a list if the parameter takes several."""
     if not getattr(parameter, "multiple", False) and parameter.nargs != -1:
-        return _as_typed(value)
-    return [_as_typed(one) for one in (value if isinstance(value, list) else [value])]
+        return _write_as_typed(value)
+    return [_write_as_typed(one) for one in (value if isinstance(value, list) else [value])]
 
 
-def _long_name(parameter: Any) -> str:
+def _find_long_name(parameter: Any) -> str:
     """Return a parameter's longest flag without dashes, or its name if there is no long flag."""
     flags = (flag[2:] for flag in parameter.opts if flag.startswith("--"))
     return max(flags, key=len, default=str(parameter.name))
 
 
-def _dashed(key: str) -> str:
+def _write_dashes(key: str) -> str:
     return key.replace("_", "-")
 
 
-def _flat(table: Any, prefix: str = "") -> dict[str, Any]:
+def _flatten(table: Any, prefix: str = "") -> dict[str, Any]:
     """Return a nested table of settings by dotted path, since TOML nests `simplify.max_energy = 0.02`."""
     if not isinstance(table, dict):
         raise typer.BadParameter(
@@ -126,11 +126,11 @@ def _flat(table: Any, prefix: str = "") -> dict[str, Any]:
         )
     out: dict[str, Any] = {}
     for key, value in table.items():
-        out |= _flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {prefix + key: value}
+        out |= _flatten(value, f"{prefix}{key}.") if isinstance(value, dict) else {prefix + key: value}
     return out
 
 
-def _as_typed(value: Any) -> Any:
+def _write_as_typed(value: Any) -> Any:
     """Return a TOML value as typed on the command line, such as 1,1,1 for [1, 1, 1]."""
     if isinstance(value, str) and not value.isprintable():
         raise typer.BadParameter(f"{value!r} holds control characters{_BACKSLASHES}")
@@ -139,7 +139,7 @@ def _as_typed(value: Any) -> Any:
     return str(value).lower() if isinstance(value, bool) else str(value)
 
 
-def printed(ctx: typer.Context, values: dict[str, Any]) -> str:
+def write_config(ctx: typer.Context, values: dict[str, Any]) -> str:
     """Format a call's inputs and options, with defaults but without None, for `load_config`."""
     lines = [f"[{ctx.info_name}]"]
     constants: list[str] = []
@@ -152,9 +152,8 @@ def printed(ctx: typer.Context, values: dict[str, Any]) -> str:
             constants = list(value)
             continue
         many = parameter.nargs == -1
-        lines.append(
-            f"{_long_name(parameter)} = {_toml([str(item) for item in value] if many else _plain(value))}"
-        )
+        shown = [str(item) for item in value] if many else _simplify(value)
+        lines.append(f"{_find_long_name(parameter)} = {_toml(shown)}")
     if constants:
         lines.append(f"[{ctx.info_name}.set]")
         pairs = (text.partition("=") for text in constants)
@@ -162,13 +161,13 @@ def printed(ctx: typer.Context, values: dict[str, Any]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _plain(value: Any) -> Any:
+def _simplify(value: Any) -> Any:
     """Return an option's value as a TOML type: 5,10 becomes [5, 10], 10.0 becomes 10, the rest text."""
     if isinstance(value, list):
-        items = [_plain(item) for item in value]
+        items = [_simplify(item) for item in value]
         return items if len(items) > 1 else items[0]
     if isinstance(value, tuple) and type(value).__str__ is tuple.__str__:
-        return [_plain(item) for item in value]
+        return [_simplify(item) for item in value]
     if isinstance(value, float) and value.is_integer() and abs(value) < 1e15:
         return int(value)
     if isinstance(value, bool | int | float) and math.isfinite(value):

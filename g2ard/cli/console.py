@@ -36,10 +36,10 @@ _BAR = 12, 40
 """Fewest and most characters of a bar."""
 
 
-def duration(seconds: float) -> str:
+def format_duration(seconds: float) -> str:
     """Format a duration.
 
-    >>> duration(3.14159), duration(75), duration(4000)
+    >>> format_duration(3.14159), format_duration(75), format_duration(4000)
     ('3.1 s', '1 min 15 s', '1 h 06 min')
     """
     if seconds < 60:
@@ -49,10 +49,10 @@ def duration(seconds: float) -> str:
     return f"{int(seconds // 3600)} h {int(seconds % 3600 // 60):02d} min"
 
 
-def _clock(seconds: float) -> str:
+def _format_clock(seconds: float) -> str:
     """Format a duration as on a clock.
 
-    >>> _clock(75.2), _clock(4000)
+    >>> _format_clock(75.2), _format_clock(4000)
     ('1:15', '1:06:40')
     """
     minutes, rest = divmod(int(seconds), 60)
@@ -60,17 +60,17 @@ def _clock(seconds: float) -> str:
     return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
 
 
-def _figure(name: str, cell: str) -> str:
+def _format_figure(name: str, cell: str) -> str:
     """Format a cell of a table outside of it, with the unit of its header behind.
 
-    >>> _figure("PSNR, dB", "31.20"), _figure("views", "8")
+    >>> _format_figure("PSNR, dB", "31.20"), _format_figure("views", "8")
     ('PSNR 31.20 dB', 'views 8')
     """
     what, _, unit = name.partition(", ")
     return f"{what} {cell} {unit}".rstrip()
 
 
-def wrapped(text: str) -> str:
+def wrap(text: str) -> str:
     """Break lines between words where a terminal would break them within; paths stay whole."""
     if not sys.stderr.isatty():
         return text
@@ -198,7 +198,7 @@ class Console:
         with self._lock:
             if self._stage is not None and not self._stage.total:
                 self._end_stage()  # its length was unknown; the message tells its result
-            text = wrapped(text)
+            text = wrap(text)
             if self._live is not None:
                 self._live.console.print(text, markup=False, highlight=False, soft_wrap=True)
             else:
@@ -207,7 +207,7 @@ class Console:
     def error(self, text: str) -> None:
         with self._lock:
             self._clear()
-            print(wrapped(f"g2ard: {text}"), file=sys.stderr, flush=True)
+            print(wrap(f"g2ard: {text}"), file=sys.stderr, flush=True)
 
     def table(self, title: str, columns: list[str], rows: list[list[str]], *, stdout: bool = False) -> None:
         """Print a table; columns with a header are right-aligned, except the first.
@@ -234,7 +234,7 @@ class Console:
             if table.show_header and min(first, _NAME) + sum(others) + 3 * len(columns) + 1 > screen.width:
                 for row in rows:
                     figures = zip(columns[1:], row[1:], strict=True)
-                    told = [_figure(name, cell) for name, cell in figures if cell]
+                    told = [_format_figure(name, cell) for name, cell in figures if cell]
                     screen.print(f"{row[0]}: {', '.join(told)}", markup=False, highlight=False)
             else:
                 screen.print(table, markup=False, highlight=False)
@@ -302,11 +302,11 @@ class Console:
 
     def _print(self, stage: _Stage, now: float) -> None:
         count = f"{stage.done}/{stage.total}" if stage.total > 1 else str(stage.done or "")
-        parts = [f"{stage.name}: {count}".rstrip(), duration(now - stage.began)]
+        parts = [f"{stage.name}: {count}".rstrip(), format_duration(now - stage.began)]
         if stage.ended is None and (left := stage.left(now)) is not None:
-            parts.append(f"ETA {duration(left)}")
+            parts.append(f"ETA {format_duration(left)}")
             if (whole := self._whole(stage, now, left)) is not None:
-                parts.append(f"all {duration(whole)}")
+                parts.append(f"all {format_duration(whole)}")
         print("  ".join([*parts, *stage.figures]), file=sys.stderr, flush=True)
 
     def _draw(self) -> None:
@@ -348,10 +348,10 @@ class Console:
         elif stage.done:
             cells.append(f"{stage.done:,}")
         if stage.ended is None and (left := stage.left(now)) is not None:
-            cells.append(f"ETA {_clock(left)}")
+            cells.append(f"ETA {_format_clock(left)}")
             if (whole := self._whole(stage, now, left)) is not None:
-                cells.append(f"all {_clock(whole)}")
-        cells.append(_clock((stage.ended or now) - stage.began))
+                cells.append(f"all {_format_clock(whole)}")
+        cells.append(_format_clock((stage.ended or now) - stage.began))
         while len(cells) > 1 and len("  ".join(cells)) > free:
             cells.pop()
         free -= len("  ".join([*cells, ""]))

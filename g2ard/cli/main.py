@@ -8,8 +8,8 @@ from typing import TextIO
 
 import typer
 
-from g2ard.cli.app import app, listing, register_commands
-from g2ard.cli.console import wrapped
+from g2ard.cli.app import app, create_listing, register_commands
+from g2ard.cli.console import wrap
 from g2ard.system import interrupt
 
 _COMPLETION = ("--show-completion", "--install-completion")
@@ -19,7 +19,7 @@ def main() -> None:
     """Run the `g2ard` program."""
     _name_shell(sys.argv[1:])
     if sys.argv[1:] in ([], ["-h"], ["--help"]) and "_G2ARD_COMPLETE" not in os.environ:
-        run_program(listing(), "g2ard")  # importing the commands takes time
+        run_program(create_listing(), "g2ard")  # importing the commands takes time
     register_commands(next(iter(sys.argv[1:]), None))
     run_program(app, "g2ard")
 
@@ -39,12 +39,12 @@ def run_program(app: typer.Typer, name: str) -> None:
     except typer.Abort:
         status = interrupt.status()
     except typer.TyperException as e:
-        from g2ard.cli.usage import usage_line
+        from g2ard.cli.usage import describe_usage_error
 
-        message = usage_line(e)
+        message = describe_usage_error(e)
         where = getattr(getattr(e, "ctx", None), "command_path", name)
         if message:  # empty when a group without arguments has already shown its help
-            print(wrapped(f"{where}: {message} (see {where} --help)"), file=sys.stderr)
+            print(wrap(f"{where}: {message} (see {where} --help)"), file=sys.stderr)
         status = e.exit_code
     gc.freeze()  # skip the final collection
     sys.stdout.flush()

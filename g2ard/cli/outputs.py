@@ -11,7 +11,7 @@ from g2ard.cli.run import Run
 from g2ard.jobs.budget import Budget
 
 
-def budgets_of(run: Run, *, optional: bool = False) -> list[Budget]:
+def read_budgets(run: Run, *, optional: bool = False) -> list[Budget]:
     """Return the budgets of the options, and check that exactly one kind is given, or none if `optional`."""
     counts, ratios, fit, min_psnr, min_ssim = (run.shared[name] for name in BUDGETS)
     quality = min_psnr is not None or min_ssim is not None
@@ -30,9 +30,9 @@ def budgets_of(run: Run, *, optional: bool = False) -> list[Budget]:
     return [Budget(ratio=ratio) for several in ratios or [] for ratio in several]
 
 
-def budget_of(run: Run, *, optional: bool = False) -> Budget | None:
+def read_budget(run: Run, *, optional: bool = False) -> Budget | None:
     """Return the budget of the options, and check that it is the only one; None if `optional` and missing."""
-    budgets = budgets_of(run, optional=optional)
+    budgets = read_budgets(run, optional=optional)
     if len(budgets) > 1:
         raise typer.BadParameter(
             "give one budget, and run the command once for each; commas separate counts, so write a single "

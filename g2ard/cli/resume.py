@@ -38,9 +38,9 @@ CALL_OPTIONS = (
 
 def is_finished(run: Run, place: Path, resume: bool, output: Path) -> bool:
     """Return whether --resume finds `output` finished; raise an error for other options or inputs."""
-    if not resume or run.overwrite or left_at(place):
+    if not resume or run.overwrite or has_checkpoints(place):
         return False
-    record = record_of(output)
+    record = read_record(output)
     if record is None:
         return False
     check_same(run, record, output)
@@ -64,11 +64,11 @@ def check_same(run: Run, record: Mapping[str, Any], output: Path, *others: str) 
             hint="-w without --resume starts over",
         )
     known = record.get("inputs", {})
-    present = identities(run.input_files())
+    present = identify_files(run.input_files())
     missing = [path for path in run.named_inputs() if not path.exists()]  # without them, nothing is read anew
     gone = [Path(name) for name in known if name not in present and not Path(name).is_file()]
     lost = [str(path) for path in gone if not {real_path(path), *real_path(path).parents} & set(missing)]
-    present |= identities(Path(name) for name in known if name not in present and Path(name).is_file())
+    present |= identify_files(Path(name) for name in known if name not in present and Path(name).is_file())
     changed = [name for name, identity in present.items() if identity != known.get(name)]
     for name in sorted([*changed, *lost]):
         raise OutputError(
@@ -76,7 +76,7 @@ def check_same(run: Run, record: Mapping[str, Any], output: Path, *others: str) 
         )
 
 
-def identities(files: Iterable[Path]) -> dict[str, Any]:
+def identify_files(files: Iterable[Path]) -> dict[str, Any]:
     """Return the identity of each file by its path, relative to the working folder if it is inside."""
     here = real_path(".")
     absolute = {real_path(path) for path in files}
@@ -84,10 +84,10 @@ def identities(files: Iterable[Path]) -> dict[str, Any]:
     return dict(zip(map(str, paths), file_identity(paths), strict=True))
 
 
-def record_of(output: Path) -> dict[str, Any] | None:
+def read_record(output: Path) -> dict[str, Any] | None:
     """Return the options and inputs of the command that finished the output, or None if that is not known,
     as of an output that was moved or is another file."""
-    file = _record_file(output)
+    file = _place_record(output)
     if not (file.is_file() and is_taken(output)):
         return None
     try:
@@ -98,7 +98,7 @@ def record_of(output: Path) -> dict[str, Any] | None:
     return record if known else None
 
 
-def _record_file(output: Path) -> Path:
+def _place_record(output: Path) -> Path:
     """Return the file in the user's cache for the record of a finished output."""
     from g2ard.system.keys import key_of
 
@@ -106,15 +106,15 @@ def _record_file(output: Path) -> Path:
 
 
 @contextmanager
-def recorded(run: Run, output: Path) -> Iterator[None]:
+def record_finish(run: Run, output: Path) -> Iterator[None]:
     """Record options and inputs when `output` is written, so that --resume finds it finished."""
-    inputs = identities(run.input_files())
+    inputs = identify_files(run.input_files())
     yield
     if is_taken(output):
         record = {"config": run.config, "inputs": inputs, "output": file_identity([output])}
         text = json.dumps(record, default=str)
         with suppress(OSError, OutputError):  # without a cache, --resume answers that the output exists
-            file = _record_file(output)
+            file = _place_record(output)
             file.parent.mkdir(parents=True, exist_ok=True)
             with atomic_output(file, overwrite=True) as temporary:
                 temporary.write_text(text, encoding="utf-8", newline="\n")
@@ -135,7 +135,7 @@ def began_output(place: Path, output: Path) -> bool:
 
 def drop_ended(run: Run, place: Path, resume: bool, output: Path) -> bool:
     """Remove checkpoints of a run that was killed after it recorded its output, and return whether it was."""
-    record = record_of(output) if resume and not run.overwrite and place.exists() else None
+    record = read_record(output) if resume and not run.overwrite and place.exists() else None
     if record is None:
         return False
     check_same(run, record, output)
@@ -145,7 +145,7 @@ def drop_ended(run: Run, place: Path, resume: bool, output: Path) -> bool:
     return True
 
 
-def checkpoint_beside(output: Path, ending: str) -> Path:
+def place_checkpoint(output: Path, ending: str) -> Path:
     """Return the hidden place for checkpoints of a scene, beside its file or SOG folder."""
     whole = output.parent if output.name == "meta.json" else output
     return whole.parent / hidden_name(whole.name, ending)
@@ -172,7 +172,7 @@ def check_stopped(run: Run, place: Path, resume: bool, output: Path) -> None:
         raise typer.Exit
     if resume and place.is_file():
         drop_damaged(place)
-    left = left_at(place)
+    left = has_checkpoints(place)
     if resume and not left:
         run.say(f"{output}: nothing to resume, starting over")
     if left and not (resume or run.overwrite):
@@ -191,7 +191,7 @@ def stoppable(run: Run, place: Path, resume: bool, output: Path) -> Iterator[Non
             if is_taken(output) and not run.overwrite:  # another run wrote it since it was checked
                 raise OutputError("exists", path=output, hint="{overwrite=True} replaces it")
             _drop_temporaries(place, output)
-            with kept(run, place, resume, output, f"from {place}"), recorded(run, output):
+            with keep_checkpoints(run, place, resume, output, f"from {place}"), record_finish(run, output):
                 yield
     finally:
         drop_empty(made)
@@ -210,7 +210,7 @@ def _drop_temporaries(place: Path, output: Path) -> None:
 
 
 @contextmanager
-def kept(run: Run, place: Path, resume: bool, what: Path, where: str) -> Iterator[None]:
+def keep_checkpoints(run: Run, place: Path, resume: bool, what: Path, where: str) -> Iterator[None]:
     """Remove checkpoints at `place` unless they are resumed; after an error or Ctrl-C say `where` they are.
 
     Args:
@@ -218,38 +218,38 @@ def kept(run: Run, place: Path, resume: bool, what: Path, where: str) -> Iterato
     """
     if not resume:
         _remove(place)
-    elif left_at(place):
-        say_from(run, place, what)
+    elif has_checkpoints(place):
+        tell_start(run, place, what)
     try:
         yield
     except (Exception, KeyboardInterrupt) as error:
-        if left_at(place) and not (resume and isinstance(error, InputError)):
+        if has_checkpoints(place) and not (resume and isinstance(error, InputError)):
             run.kept.append(f"run the same command with --resume to continue {where}")
         raise
     else:
         _remove(place)
     finally:
-        if not left_at(place):
+        if not has_checkpoints(place):
             _remove(place)
 
 
-def say_from(run: Run, place: Path, what: Path) -> None:
+def tell_start(run: Run, place: Path, what: Path) -> None:
     """Say where a resumed run continues: after its finished steps, or from a step of recovery."""
-    from g2ard.stages.recover.checkpoint import steps_at
+    from g2ard.stages.recover.checkpoint import count_steps
 
-    done = finished_steps(place)
-    steps = None if place.is_dir() else steps_at(place)
+    done = list_finished_steps(place)
+    steps = None if place.is_dir() else count_steps(place)
     where = f"after {', '.join(done)}" if done else f"from {place if steps is None else f'step {steps:,}'}"
     run.say(f"{what}: continues {where}")
 
 
-def finished_steps(place: Path) -> list[str]:
+def list_finished_steps(place: Path) -> list[str]:
     """Return the names of finished steps in a folder of checkpoints."""
     stems = (path.stem for path in sorted(place.glob("[!.]*.npz")))  # the name, and a hash of 16 digits
     return list(dict.fromkeys(stem[:-17] for stem in stems if not stem.endswith(".checkpoint")))
 
 
-def left_at(place: Path) -> bool:
+def has_checkpoints(place: Path) -> bool:
     """Return whether `place` is a checkpoint or a folder with checkpoints."""
     return any(item.name != OPTIONS for item in place.iterdir()) if place.is_dir() else place.exists()
 

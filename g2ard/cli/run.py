@@ -14,7 +14,7 @@ import typer
 from g2ard.cli.budget_options import Counts, Ratios
 from g2ard.cli.claims import Claims
 from g2ard.cli.console import Console
-from g2ard.cli.usage import in_flags
+from g2ard.cli.usage import spell_in_flags
 from g2ard.config.choices import RenderModel, ViewFormat
 from g2ard.config.schema import Config, full_paths, parse_settings
 from g2ard.errors import InputError
@@ -101,7 +101,7 @@ class Run(Claims):
             if not name or any(f".{path}".endswith(f".{name}") for path in typed):
                 raise typer.BadParameter(f"--set: {e}") from None
             option = e.at(parameter=name.rpartition(".")[2])
-            raise typer.BadParameter(in_flags(option, self.flags)) from None
+            raise typer.BadParameter(spell_in_flags(option, self.flags)) from None
 
     @contextmanager
     def usage(self) -> Iterator[None]:
@@ -109,7 +109,7 @@ class Run(Claims):
         try:
             yield
         except InputError as error:
-            raise typer.BadParameter(in_flags(error, self.flags)) from None
+            raise typer.BadParameter(spell_in_flags(error, self.flags)) from None
 
     def refuse_typed(self, reason: str, *names: str) -> None:
         """Raise a usage error if an option without effect is on the command line; the reason ends it."""

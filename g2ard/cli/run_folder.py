@@ -16,10 +16,10 @@ from g2ard.cli.resume import (
     OPTIONS,
     check_same,
     check_stopped,
-    finished_steps,
-    identities,
-    kept,
-    left_at,
+    has_checkpoints,
+    identify_files,
+    keep_checkpoints,
+    list_finished_steps,
 )
 from g2ard.cli.run import Run
 from g2ard.config.choices import BLACK, WHITE, Colour, ViewFormat
@@ -36,7 +36,7 @@ from g2ard.jobs.cost import LARGEST_DENSE
 from g2ard.jobs.viewer_frame import backdrop, frame_with
 from g2ard.pipeline.distill import RunViews
 from g2ard.rendering.targets import fill
-from g2ard.report.labels import DENSE, RESULT, labels_of, names_of
+from g2ard.report.labels import DENSE, RESULT, label_scenes, name_scenes
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats
 from g2ard.viewer.page import write_page
@@ -89,7 +89,7 @@ class RunFolder:
         may write here."""
         self._run.spare_inputs(self.scene, *self._other_scenes(), self._simplified, self._views, self._scored)
         check_unlocked(self.path)
-        left = left_at(self.unfinished)
+        left = has_checkpoints(self.unfinished)
         killed = self.path.is_dir() and [path.name for path in self.path.iterdir()] == [_WORK_FOLDER]
         done = self._resume and not self._run.overwrite and not left
         done = done and self.scene.exists() and self._report.exists()
@@ -110,7 +110,7 @@ class RunFolder:
         """Return the finished run's report; raise an `OutputError` if its budget, options or input files were
         others."""
         record = read_json(self._report)
-        check_same(self._run, record, self.path, *_other_budget(record, budget))
+        check_same(self._run, record, self.path, *_name_other_budget(record, budget))
         assert isinstance(record, dict)
         return record
 
@@ -131,12 +131,12 @@ class RunFolder:
 
         It holds checkpoints too, which are kept after an error or Ctrl-C.
         """
-        self._inputs = identities([*self._run.input_files(), *job.photos])
+        self._inputs = identify_files([*self._run.input_files(), *job.photos])
         made = [] if self.path.exists() else [self.path]
         self.path.mkdir(parents=True, exist_ok=True)
         try:
             with locked(self.path):
-                if self.scene.exists() and not (self._run.overwrite or left_at(self.unfinished)):
+                if self.scene.exists() and not (self._run.overwrite or has_checkpoints(self.unfinished)):
                     raise OutputError("exists", path=self.path, hint="{overwrite=True} replaces it")
                 drop_temporaries(self.path)
                 with self._checkpoints(job):
@@ -147,9 +147,9 @@ class RunFolder:
     @contextmanager
     def _checkpoints(self, job: DistillJob) -> Iterator[None]:
         """Create the folder for checkpoints; after an error or Ctrl-C, keep what it holds."""
-        if self._resume and not left_at(self.unfinished):
+        if self._resume and not has_checkpoints(self.unfinished):
             self._run.say(f"{self.path}: nothing to resume, starting over")
-        with kept(self._run, self.unfinished, self._resume, self.path, f"in {self.path}"):
+        with keep_checkpoints(self._run, self.unfinished, self._resume, self.path, f"in {self.path}"):
             self.unfinished.mkdir(parents=True, exist_ok=True)
             counts = {"input_count": job.total, "output_count": job.budget.count}
             text = json.dumps({**counts, "config": self._run.config}, default=str)
@@ -177,7 +177,7 @@ class RunFolder:
         own = views.pool or views.train
         if "test" not in own.splits:
             splits = ("train",) * len(own.cameras) + ("test",) * len(views.test)
-            own = ViewSet(_joined(own.cameras, views.test), splits=splits)
+            own = ViewSet(_join_views(own.cameras, views.test), splits=splits)
         write_views(self._views, own.cameras, splits=own.splits, overwrite=True)
         also: ViewFormat = run.config["views_format"]
         if views.pool is not None and also in _VIEW_FILES:
@@ -185,7 +185,7 @@ class RunFolder:
         if targets.apart is None:
             self._scored.unlink(missing_ok=True)
             return
-        scored = _joined(targets.apart.cameras, targets.held_out.cameras)
+        scored = _join_views(targets.apart.cameras, targets.held_out.cameras)
         write_views(self._scored, scored, splits=["test"] * len(scored), overwrite=True)
 
     def write_pages(
@@ -199,14 +199,19 @@ class RunFolder:
             told: the summary that the command prints.
             drawn: the views to show, and pictures of them.
         """
-        from g2ard.report.distilled import distill_report, pictures, preview, renderers_of
+        from g2ard.report.distilled import (
+            create_renderers,
+            draw_pictures,
+            write_distill_report,
+            write_preview,
+        )
 
-        title = f"{names_of([Path(str(source))])[0]}: {report.title}"
+        title = f"{name_scenes([Path(str(source))])[0]}: {report.title}"
         scenes = [] if report.photos else [("simplified", done.simplified)]  # a start of photos is a blur
         scenes.append((RESULT, done.splats))
         recover = job.config.recover
         page = self.path / "report.html"
-        renderers = renderers_of(scenes, recover.background)
+        renderers = create_renderers(scenes, recover.background)
         best = drawn.best
         shown = []
         with self._run.showing(_PICTURE):
@@ -215,8 +220,8 @@ class RunFolder:
             if job.renders and self._backdrop(recover.background, job.prior) is None:
                 on_white = partial(job.dense.images, background=WHITE)
             rows = range(len(best.cameras))
-            shown = [pictures(best, row, renderers, on_white, drawn) for row in rows]
-            preview(self.path / _PICTURE, shown, scenes)
+            shown = [draw_pictures(best, row, renderers, on_white, drawn) for row in rows]
+            write_preview(self.path / _PICTURE, shown, scenes)
         line = ""
         if self._run.config["page"]:
             dense = None
@@ -235,7 +240,7 @@ class RunFolder:
             files = {text: name for text, name in files.items() if (self.path / name).exists()}
             command = shlex.join(["g2ard", *sys.argv[1:]])
             more: Any = {"best": shown[0], "on_white": on_white, "command": command, "files": files}
-            distill_report(page, title, renderers, drawn, report, told, **more)
+            write_distill_report(page, title, renderers, drawn, report, told, **more)
         return report, line
 
     def write_report(self, report: Report) -> None:
@@ -266,14 +271,14 @@ class RunFolder:
             return None, f"{self._view} skipped: over {most:,} Gaussians (`g2ard view` writes it anyway)"
         stand = frame_with(splats, cameras)
         behind = self._backdrop(background, splats if dense is None else dense[1], of_points)
-        shown: list[Source | str] = [names_of([self.path])[0]]
+        shown: list[Source | str] = [name_scenes([self.path])[0]]
         scenes = [splats]
         roles = [RESULT]
         if dense is not None and count < len(dense[1]) <= LARGEST_DENSE:
             shown = [dense[0], *shown]
             scenes = [dense[1], splats]
             roles = [DENSE, RESULT]
-        labels = labels_of(shown, [len(scene) for scene in scenes], roles)
+        labels = label_scenes(shown, [len(scene) for scene in scenes], roles)
         turned = [(label, stand.of(scene)) for label, scene in zip(labels, scenes, strict=True)]
         written, _ = write_page(self._view, turned, start=stand.start, background=behind, overwrite=True)
         return written, f"view: {self._view} ({written / 1e6:.2f} MB)"
@@ -299,7 +304,7 @@ class RunFolder:
         return [path for path in names if path != self.scene]
 
 
-def _joined(cameras: Cameras, held_out: Cameras) -> Cameras:
+def _join_views(cameras: Cameras, held_out: Cameras) -> Cameras:
     """Combine views, and mark names of held-out ones that other views have too."""
     taken = set(cameras.names)
     named = (
@@ -308,16 +313,16 @@ def _joined(cameras: Cameras, held_out: Cameras) -> Cameras:
     return Cameras.of([*cameras, *named])
 
 
-def stopped_run(folder: Path) -> dict[str, Any] | None:
+def describe_stopped_run(folder: Path) -> dict[str, Any] | None:
     """Describe an interrupted run (checkpoints, counts, options), or return None without one."""
     work = folder / _WORK_FOLDER
-    if not left_at(work):
+    if not has_checkpoints(work):
         return None
     told = read_json(work / OPTIONS) if (work / OPTIONS).exists() else {}
-    return {"path": str(folder), "kind": "stopped run", "kept": finished_steps(work), **told}
+    return {"path": str(folder), "kind": "stopped run", "kept": list_finished_steps(work), **told}
 
 
-def _other_budget(before: Mapping[str, Any], budget: Budget | None) -> list[str]:
+def _name_other_budget(before: Mapping[str, Any], budget: Budget | None) -> list[str]:
     """Return the name of the budget if an earlier run's was another one."""
     if budget is None or budget.is_measured or "output_count" not in before:  # options are compared
         return []

@@ -41,12 +41,12 @@ def tell_run(
         source: what was distilled.
         page: line about the page.
     """
-    from g2ard.report.run import COLUMNS, rows_of, sizes_of
+    from g2ard.report.run import COLUMNS, describe_sizes, list_rows
 
-    run.say(counts_line(report))
-    title = f"held-out views against {report.against}, {sizes_of(report)}, {report.stages}:"
-    run.console.table(title, list(COLUMNS), rows_of(report))
-    for line in told(report, verbose=run.verbose):
+    run.say(summarize_counts(report))
+    title = f"held-out views against {report.against}, {describe_sizes(report)}, {report.stages}:"
+    run.console.table(title, list(COLUMNS), list_rows(report))
+    for line in list_remarks(report, verbose=run.verbose):
         run.say(line)
     say_views(run, report.views, job.config.select.views_count is not None)
     if not job.config.recover.from_points:  # such points are no scene to compare with
@@ -62,45 +62,47 @@ def tell_plan(run: Run, count: int, cost: Cost, plan: TilePlan | None = None) ->
     run.answer(
         f"{plural(count, 'Gaussian')}, {plural(cost.views, 'target image')} of {cost.pixels:,} pixels, "
         f"{plural(cost.steps, 'step')}: roughly {max(1, cost.seconds):.0f} s on two cores and "
-        f"{memory_of(cost)}"
+        f"{describe_memory(cost)}"
     )
     run.say_dry()
-    run.result({"count": count, **asdict(cost), "seconds": cost.seconds, **tiles_of(plan)})
+    run.result({"count": count, **asdict(cost), "seconds": cost.seconds, **count_tiles(plan)})
 
 
-def memory_of(cost: Cost) -> str:
+def describe_memory(cost: Cost) -> str:
     """Describe the memory of a job, and the disk that tiles take."""
     disk = f", and {cost.disk / 1e6:,.0f} MB of disk" if cost.disk else ""
     return f"{cost.bytes / 1e6:,.0f} MB{disk}"
 
 
-def tiles_of(plan: TilePlan | None) -> dict[str, int]:
+def count_tiles(plan: TilePlan | None) -> dict[str, int]:
     """Return the numbers of tiles and workers, for the result of a dry run."""
     return {} if plan is None else {"tiles": plan.tiles, "workers": plan.workers}
 
 
-def counts_line(report: RunReport) -> str:
+def summarize_counts(report: RunReport) -> str:
     """Return counts, sizes and times."""
     seconds = {name: value for name, value in report.seconds.items() if name != "resumed"}
     times = ", ".join(f"{name} {value:.1f} s" for name, value in seconds.items())
     return f"{report.title}, {report.sizes}; {times}"
 
 
-def told(report: RunReport, *, verbose: bool = False) -> list[str]:
+def list_remarks(report: RunReport, *, verbose: bool = False) -> list[str]:
     """Return lines on recovery, losses, unseen parts and packing; `verbose` adds idle
     regularisers."""
     from g2ard.jobs.format_loss import score_lines
-    from g2ard.stages.recover.report import cut_short, outcome, unregularized
+    from g2ard.stages.recover.report import describe_idle_regularizers, describe_outcome, describe_time_limit
     from g2ard.stages.simplify.gaps import RECOVERED_GAPS, gaps_line
 
     rounds = [entry.recover for entry in report.rounds]
-    lines = _own_size(report)
-    lines += [outcome(one) for entry in rounds for one in entry]
-    lines += [cut_short(one) for entry in rounds[-1:] for one in entry[-1:]]
+    lines = _compare_own_size(report)
+    lines += [describe_outcome(one) for entry in rounds for one in entry]
+    lines += [describe_time_limit(one) for entry in rounds[-1:] for one in entry[-1:]]
     lines += [str(one.exposure) for entry in rounds for one in entry[-1:] if one.exposure]
-    lines += [unregularized(rounds)] if verbose else []
+    lines += [describe_idle_regularizers(rounds)] if verbose else []
     start = "start" if report.photos else "simplified scene"
-    lines += [loss(kind, f"the {start} is better there (--keep writes it too)") for kind in report.kinds]
+    lines += [
+        describe_loss(kind, f"the {start} is better there (--keep writes it too)") for kind in report.kinds
+    ]
     lines.append(gaps_line(report.opacity_lost, RECOVERED_GAPS))
     if report.unseen and report.unseen > _LEAST_REPORTED_SHARE:
         lines.append(f"{report.unseen:.0%} of the scene is in no view: simplified but not recovered")
@@ -112,7 +114,7 @@ def told(report: RunReport, *, verbose: bool = False) -> list[str]:
     return [line for line in lines if line is not None]
 
 
-def _own_size(report: RunReport) -> list[str | None]:
+def _compare_own_size(report: RunReport) -> list[str | None]:
     """Return the scores at the views' own size, if they were measured, and whether --size did harm."""
     if not report.own_size:
         return []
@@ -129,7 +131,7 @@ def _own_size(report: RunReport) -> list[str | None]:
     return lines
 
 
-def loss(
+def describe_loss(
     kind: KindScore, hint: str = "the simplified scene is better there (--keep writes it too)"
 ) -> str | None:
     """Describe what recovery lost in the views of a kind, if anything; `hint` ends a warning."""

@@ -15,20 +15,20 @@ _FLAGS = {"overwrite=True": "-w (--overwrite)"}
 """Parameters, alone or with a value, whose flag has another name."""
 
 
-def flags_of(command: Any) -> dict[str, str]:
+def map_flags(command: Any) -> dict[str, str]:
     """Return the long flag of each option of a command, by parameter."""
     options = (p for p in command.params if p.param_type_name == "option")
     return {str(option.name): max(option.opts, key=len) for option in options}
 
 
-def in_flags(error: G2ardError, flags: Mapping[str, str]) -> str:
+def spell_in_flags(error: G2ardError, flags: Mapping[str, str]) -> str:
     """Return an error's line with flags instead of parameters.
 
     >>> from g2ard.errors import InputError, OutputError
-    >>> in_flags(OutputError("exists", path="a.ply", hint="{overwrite=True} replaces it"), {})
+    >>> spell_in_flags(OutputError("exists", path="a.ply", hint="{overwrite=True} replaces it"), {})
     'a.ply: exists; -w (--overwrite) replaces it'
     >>> error = InputError("has no focal length", path="a.jpg", hint="give {focal=PIXELS}")
-    >>> in_flags(error, {"focal": "--focal"})
+    >>> spell_in_flags(error, {"focal": "--focal"})
     'a.jpg: has no focal length; give --focal PIXELS'
     """
 
@@ -43,10 +43,10 @@ def in_flags(error: G2ardError, flags: Mapping[str, str]) -> str:
     return error.line(spelled)
 
 
-def meant(words: Iterable[str], known: Iterable[str]) -> str:
+def suggest_names(words: Iterable[str], known: Iterable[str]) -> str:
     """List unknown words, each with the known words that are close to it.
 
-    >>> meant(["rato", "zzz"], ["ratio", "count"])
+    >>> suggest_names(["rato", "zzz"], ["ratio", "count"])
     'rato (did you mean ratio?), zzz'
     """
     from difflib import get_close_matches
@@ -59,13 +59,13 @@ def meant(words: Iterable[str], known: Iterable[str]) -> str:
     return ", ".join(told)
 
 
-def usage_line(error: typer.TyperException) -> str:
+def describe_usage_error(error: typer.TyperException) -> str:
     """Return the line for a usage error: typer's message, or a shorter one for an invalid value."""
     refused = getattr(error.__cause__, "errors", None)
     parameter: Any = getattr(error, "param", None)
-    if type(error).__name__ == "MissingParameter" and (missing := _missing(error)):
+    if type(error).__name__ == "MissingParameter" and (missing := _list_missing(error)):
         return f"missing {' and '.join(missing)}"
-    if (long := _of_one_dash(error)) is not None:
+    if (long := _find_single_dash(error)) is not None:
         return f"{long[1:]}: long options need two dashes; write {long}"
     if isinstance(error, typer.BadParameter) and parameter is None:  # a check of several options at once
         return error.message
@@ -73,13 +73,13 @@ def usage_line(error: typer.TyperException) -> str:
         return " ".join(error.format_message().split())
     given = refused()[0]["input"]
     ctx = getattr(error, "ctx", None)
-    in_file = ctx is not None and _source(ctx, parameter.name) == "DEFAULT_MAP"
+    in_file = ctx is not None and _find_source(ctx, parameter.name) == "DEFAULT_MAP"
     source = f" (from {ctx.params['config']})" if ctx and in_file else ""
-    expected = f"expected {_allowed(parameter)}, got {given!r}"
+    expected = f"expected {_describe_allowed(parameter)}, got {given!r}"
     return f"Invalid value for {parameter.get_error_hint()}: {expected}{source}"
 
 
-def _missing(error: Any) -> list[str]:
+def _list_missing(error: Any) -> list[str]:
     """List a missing option with the others that are missing too, and the budget."""
     options = [p for p in error.ctx.command.params if p.param_type_name == "option"]
     if error.param not in options:
@@ -97,7 +97,7 @@ def _missing(error: Any) -> list[str]:
     return [*found, *([f"a budget ({BUDGET_FLAGS})"] if budgets and not budgets & typed else [])]
 
 
-def _of_one_dash(error: typer.TyperException) -> str | None:
+def _find_single_dash(error: typer.TyperException) -> str | None:
     """Return a long option that was typed with a single dash, if any."""
     command: Any = getattr(getattr(error, "ctx", None), "command", None)
     long = {flag for parameter in getattr(command, "params", ()) for flag in parameter.opts}
@@ -105,16 +105,16 @@ def _of_one_dash(error: typer.TyperException) -> str | None:
     return next((word for word in words if re.match(r"--\w", word) and word in long), None)
 
 
-def typed(ctx: typer.Context, name: str) -> bool:
+def is_typed(ctx: typer.Context, name: str) -> bool:
     """Return whether an option was typed, rather than read from a config file or left at its default."""
-    return _source(ctx, name) == "COMMANDLINE"
+    return _find_source(ctx, name) == "COMMANDLINE"
 
 
-def _source(ctx: typer.Context, name: str) -> str:
+def _find_source(ctx: typer.Context, name: str) -> str:
     return getattr(ctx.get_parameter_source(name), "name", "")
 
 
-def _allowed(parameter: Any) -> str:
+def _describe_allowed(parameter: Any) -> str:
     """Describe the values an option accepts: choices, true or false, or a number within bounds."""
     descriptor = parameter.type_descriptor
     if descriptor.choices is not None:

@@ -27,7 +27,7 @@ _WORK_NAME = re.compile(r"tiles|steps|(cleaned|merged|level|written)-[0-9a-f]{16
 """Names that commands create in the work folder."""
 
 
-def tiling_of(run: Run, source: Source | None, output: Path) -> Tiling:
+def read_tiling(run: Run, source: Source | None, output: Path) -> Tiling:
     """Check the options and return them as a `Tiling`."""
     from g2ard.jobs.memory import bytes_of
     from g2ard.jobs.tile_options import Tiling
@@ -40,17 +40,17 @@ def tiling_of(run: Run, source: Source | None, output: Path) -> Tiling:
         size = None if memory is None else bytes_of(memory)
     if scheduler is not None and scheduler != "local" and "://" not in scheduler:
         raise typer.BadParameter(f"--scheduler: expected tcp://HOST:PORT or local, got {scheduler!r}")
-    folder = work or _beside(output)
+    folder = work or _place_beside(output)
     run.claim("--work", folder, folder=True)
     cores = run.threads or None
     renew = work is None or run.overwrite
     return Tiling(rows, size, workers, cores, scheduler, folder, keep=work is not None, overwrite=renew)
 
 
-def _beside(output: Path) -> Path:
+def _place_beside(output: Path) -> Path:
     """Return the default folder for tiles: beside the output, outside folders with {ratio} or {count}.
 
-    >>> [_beside(Path(name)).as_posix() for name in ("a/b.ply", "a/{ratio}x/run", "a/meta.json")]
+    >>> [_place_beside(Path(name)).as_posix() for name in ("a/b.ply", "a/{ratio}x/run", "a/meta.json")]
     ['a/.b.ply.tiles', 'a/.ratiox.tiles', '.a.tiles']
     """
     if output.name == "meta.json":  # a SOG folder

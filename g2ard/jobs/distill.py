@@ -51,7 +51,7 @@ from g2ard.rendering.targets import Subset, Targets, fill, kinds_of, kinds_told,
 from g2ard.rendering.visibility import overdraw
 from g2ard.report.distilled import Drawn
 from g2ard.report.labels import RESULT
-from g2ard.report.run import Packed, RunReport, by_kind
+from g2ard.report.run import Packed, RunReport, summarize_by_kind
 from g2ard.scene.cameras import USUAL, Cameras
 from g2ard.scene.samples import evenly_spaced
 from g2ard.scene.splats import Splats
@@ -59,7 +59,7 @@ from g2ard.stages.evaluate import Evaluation, evaluate
 from g2ard.stages.lift import in_axes, lift, lift_rows
 from g2ard.stages.photo_points.colors import colored
 from g2ard.stages.photo_points.rays import distinct
-from g2ard.stages.recover.anchors import FREE, PriorMeasures, Regularizers, measure_prior, regularizers_for
+from g2ard.stages.recover.anchors import FREE, PriorMeasures, Regularizers, choose_regularizers, measure_prior
 from g2ard.stages.recover.config import RecoverConfig, Schedule
 from g2ard.stages.simplify.gaps import say_gaps
 from g2ard.system.cached import cached_property
@@ -349,7 +349,7 @@ class DistillJob:
             apart=apart,
             size=cameras.size_text,
             own_size=None if full is None else {name: found.means for name, found in full.items()},
-            kinds=by_kind(before, after, USUAL if made else "given"),
+            kinds=summarize_by_kind(before, after, USUAL if made else "given"),
             unseen=self._unseen(done),
             warnings=self._warnings(done),
             opacity_lost=None if from_points else self.dense.opacity_lost(done.splats, cameras),
@@ -747,7 +747,7 @@ def _sources(views: RunViews, photos: bool | None, lifted: bool) -> tuple[bool, 
 def _regularizers(
     options: DistillOptions, read: _Read, prior: Splats, photos: Cameras | None
 ) -> tuple[Regularizers, str, PriorMeasures]:
-    """Choose regularisers with `regularizers_for`, or none for points of photos.
+    """Choose regularisers with `choose_regularizers`, or none for points of photos.
 
     Args:
         photos: training views, if they have photos; only then is their consistency measured.
@@ -762,7 +762,7 @@ def _regularizers(
         )
     if read.needs_photos and kind == "paper":
         kind = "paper-lift"
-    return regularizers_for(kind, prior, photos, paper=paper)
+    return choose_regularizers(kind, prior, photos, paper=paper)
 
 
 def _task(source: str, count: int, train: Cameras | None, photos: bool, *, alone: bool) -> str:

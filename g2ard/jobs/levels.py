@@ -33,7 +33,7 @@ from g2ard.levels.tileset import save_tileset as write_tileset
 from g2ard.levels.tree import Cut, Level, aligned
 from g2ard.pipeline.dense import Dense
 from g2ard.progress import Progress, Say, direction, plural, silent, unsaid
-from g2ard.report.labels import names_of
+from g2ard.report.labels import name_scenes
 from g2ard.scene.regions import sky_mask
 from g2ard.scene.samples import evenly_spaced
 from g2ard.scene.splats import Splats
@@ -431,7 +431,7 @@ def write_level_page(
     of_points = given.beside is not None and made_of_points(Path(given.beside), source)
     behind = backdrop(background, [finest], of_points=of_points)
     page, offset = folder / "index.html", np.asarray(few.offset)
-    title = names_of([Path(given.beside or folder)])[0]
+    title = name_scenes([Path(given.beside or folder)])[0]
     if kind == "sog":
         rotation, position = frame.placed(offset, few.axes)
         placed: dict[str, Any] = {"rotation": rotation, "position": position}

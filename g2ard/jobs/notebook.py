@@ -27,8 +27,8 @@ from g2ard.progress import Progress, Say, kernel, silent, unsaid
 from g2ard.rendering.renderer import Renderer
 from g2ard.rendering.sky import seen_on_sky
 from g2ard.rendering.targets import Targets
-from g2ard.report.labels import RESULT, labels_of
-from g2ard.report.sheet import contact_sheet
+from g2ard.report.labels import RESULT, label_scenes
+from g2ard.report.sheet import draw_contact_sheet
 from g2ard.scene.cameras import Camera, Cameras
 from g2ard.scene.samples import evenly_spaced
 from g2ard.scene.splats import HasSplats, Splats, scene_of
@@ -97,7 +97,7 @@ def view(
         for one, source in zip(given, shown, strict=True)
     ]
     beside = shown[0].file if isinstance(shown[0], Source) else None
-    labels = labels_of(named, [len(splats) for splats in loaded])
+    labels = label_scenes(named, [len(splats) for splats in loaded])
     stand = frame_of(loaded[0], GivenViews(views, beside, up), start=start, say=say)
     page = Path(mkdtemp(prefix="g2ard-")) / "view.html" if output is None else Path(output)
     write_page(
@@ -144,7 +144,7 @@ def _row(targets: Targets) -> NDArray[np.uint8]:
     """Return a few targets in a row, evenly spaced."""
     some = evenly_spaced(len(targets.cameras), _TARGETS)
     names = [targets.cameras.names[view] for view in some]
-    return contact_sheet([[_small(targets[int(view)]) for view in some]], names)
+    return draw_contact_sheet([[_small(targets[int(view)]) for view in some]], names)
 
 
 def _small(image: NDArray[Any]) -> NDArray[Any]:

@@ -20,11 +20,11 @@ from g2ard.jobs.teaching import Teaching, check_teacher
 from g2ard.pipeline.presets import PRESETS, configured
 from g2ard.progress import Detail, Progress, Say, plural, silent, unsaid
 from g2ard.rendering.targets import RENDERS, Exposed, Targets, checked_targets, fill, kinds_of
-from g2ard.report.run import KindScore, by_kind
+from g2ard.report.run import KindScore, summarize_by_kind
 from g2ard.scene.cameras import USUAL
 from g2ard.scene.splats import Splats
 from g2ard.stages.evaluate import evaluate
-from g2ard.stages.recover.anchors import Anchors, PriorMeasures, regularizers_for
+from g2ard.stages.recover.anchors import Anchors, PriorMeasures, choose_regularizers
 from g2ard.stages.recover.config import RecoverConfig, Schedule
 from g2ard.stages.recover.optimize import Recovered, Watch
 from g2ard.stages.recover.optimize import recover as optimize
@@ -115,7 +115,7 @@ class RecoverJob:
             for name, splats in (("simplified", self.student), ("recovered", result.splats))
         )
         given = set(self.held_out.cameras.kinds) == {USUAL}
-        return by_kind(before, after, "given" if given else USUAL)
+        return summarize_by_kind(before, after, "given" if given else USUAL)
 
 
 @checks_arguments
@@ -307,7 +307,7 @@ def prepare(
     if weights is not None:
         say(f"sampling {plural(len(weights), 'view')} by weight")
     built = None if anchors is None else _built(anchors, start, render_model, say)
-    regularizers, why, measures = regularizers_for(
+    regularizers, why, measures = choose_regularizers(
         named.get("recover.regularizers"),
         teaching.dense or built or start,
         None if teaching.dense or rough else chosen.cameras,

@@ -34,7 +34,7 @@ from g2ard.progress import Progress, Say, direction, plural, silent, unsaid
 from g2ard.scene.cameras import USUAL, Camera, Cameras, rows_by_kind
 from g2ard.scene.samples import evenly_spaced
 from g2ard.scene.splats import Splats
-from g2ard.stages.recover.config import RecoverConfig, steps_for
+from g2ard.stages.recover.config import RecoverConfig, count_steps_for_renders
 from g2ard.stages.select.light import complete
 from g2ard.stages.simplify import simplify
 
@@ -215,7 +215,7 @@ def pool_share(recover: RecoverConfig, scene: Splats, pool: Cameras) -> float:
     if recover.recovery_time is not None:
         steps = recover.recovery_time / _STEP_SECONDS
     else:
-        steps = recover.steps or steps_for(scene, pool, schedule.for_renders * schedule.steps)
+        steps = recover.steps or count_steps_for_renders(scene, pool, schedule.for_renders * schedule.steps)
     return min(1.0, max(_LEAST_SHARE, (steps / _POOL_STEPS) ** _POOL_POWER))
 
 

@@ -23,7 +23,7 @@ from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats
 from g2ard.stages.evaluate import Evaluation
 from g2ard.stages.recover.config import RecoverConfig
-from g2ard.stages.recover.loop import checked_weights
+from g2ard.stages.recover.loop import check_weights
 from g2ard.stages.recover.optimize import Watch
 from g2ard.stages.select import CoverageOptions, select
 from g2ard.stages.simplify.reduce import SimplifyReport
@@ -151,7 +151,7 @@ def distill(
         validation = checked_targets(validation, "validation")
     schedule, steps = config.recover.schedule, Steps(work, progress)
     counts = round_counts(dense, budget, config)
-    given = checked_weights(weights, len(targets.cameras))
+    given = check_weights(weights, len(targets.cameras))
     photos = isinstance(targets, Photos | PhotosOrRenders)
     total, protected, selecting, log = dense.total, None, 0.0, []
     for number, count in enumerate(counts, start=1):

@@ -44,10 +44,10 @@ class Point:
     label: str = ""
 
 
-def pareto(points: Sequence[Point]) -> list[Point]:
+def find_front(points: Sequence[Point]) -> list[Point]:
     """Return the Pareto front, sorted by x.
 
-    >>> [p.x for p in pareto([Point(1, 5, 0), Point(2, 4, 0), Point(3, 9, 0)])]
+    >>> [p.x for p in find_front([Point(1, 5, 0), Point(2, 4, 0), Point(3, 9, 0)])]
     [1, 3]
     """
     front: list[Point] = []
@@ -57,10 +57,10 @@ def pareto(points: Sequence[Point]) -> list[Point]:
     return front
 
 
-def ticks(low: float, high: float, *, log: bool = False) -> list[float]:
+def choose_ticks(low: float, high: float, *, log: bool = False) -> list[float]:
     """Return about six round values between two limits.
 
-    >>> ticks(0, 10), ticks(0.9, 120, log=True)
+    >>> choose_ticks(0, 10), choose_ticks(0.9, 120, log=True)
     ([0, 2, 4, 6, 8, 10], [1, 2, 5, 10, 20, 50, 100])
     """
     if log:
@@ -68,15 +68,15 @@ def ticks(low: float, high: float, *, log: bool = False) -> list[float]:
         last = math.ceil(math.log10(high))
         steps = (1, 2, 5) if last - first <= 4 else (1,)
         values = [m * 10.0**e for e in range(first, last + 1) for m in steps]
-        return [_neat(v) for v in values if low * 0.999 <= v <= high * 1.001]
+        return [_round(v) for v in values if low * 0.999 <= v <= high * 1.001]
     raw = (high - low) / 5
     unit = 10.0 ** math.floor(math.log10(raw))
     step = unit * min((1, 2, 2.5, 5, 10), key=lambda m: abs(m * unit - raw))
     first = math.ceil(low / step - 1e-9)
-    return [_neat(k * step) for k in range(first, math.floor(high / step + 1e-9) + 1)]
+    return [_round(k * step) for k in range(first, math.floor(high / step + 1e-9) + 1)]
 
 
-def _neat(value: float) -> float:
+def _round(value: float) -> float:
     return int(value) if value == int(value) else round(value, 10)
 
 
@@ -110,7 +110,7 @@ class _Axis:
         return self._start + (self._end - self._start) * (at - low) / (high - low)
 
 
-def chart(
+def draw_chart(
     points: Sequence[Point],
     *,
     x_label: str,
@@ -137,36 +137,35 @@ def chart(
         return ""
     x = _Axis([p.x for p in points], _LEFT, _WIDTH - _RIGHT, log=log)
     y = _Axis([p.y for p in points], _HEIGHT - _BOTTOM, _TOP, log=False)
-    parts = [*_grid(x, y), _caption(x_label, y_label)]
+    parts = [*_draw_grid(x, y), _draw_captions(x_label, y_label)]
     if front:
-        parts.append(_front(pareto(points), x, y))
+        parts.append(_draw_front(find_front(points), x, y))
     if joined:
-        parts += _lines(points, x, y)
-    parts += [_dot(p, x(p.x), y(p.y)) for p in points]
-    parts += _names(points, x, y)
+        parts += _draw_lines(points, x, y)
+    parts += [_draw_dot(p, x(p.x), y(p.y)) for p in points]
+    parts += _draw_names(points, x, y)
     return (
         f'<svg class="chart" viewBox="0 0 {_WIDTH} {_HEIGHT}" role="img" '
         f'aria-label="{escape(y_label)} against {escape(x_label)}">{"".join(parts)}</svg>'
     )
 
 
-def _grid(x: _Axis, y: _Axis) -> list[str]:
+def _draw_grid(x: _Axis, y: _Axis) -> list[str]:
     out = []
-    for value in ticks(y.low, y.high):
+    for value in choose_ticks(y.low, y.high):
         at = y(value)
         out.append(f'<line class="grid" x1="{_LEFT}" x2="{_WIDTH - _RIGHT}" y1="{at:.1f}" y2="{at:.1f}"/>')
         out.append(f'<text class="tick" x="{_LEFT - 6}" y="{at + 4:.1f}" text-anchor="end">{value:g}</text>')
-    for value in ticks(x.low, x.high, log=x.log):
+    for value in choose_ticks(x.low, x.high, log=x.log):
         at = x(value)
         bottom = _HEIGHT - _BOTTOM
         out.append(f'<line class="grid" x1="{at:.1f}" x2="{at:.1f}" y1="{_TOP}" y2="{bottom}"/>')
-        out.append(
-            f'<text class="tick" x="{at:.1f}" y="{bottom + 16}" text-anchor="middle">{_short(value)}</text>'
-        )
+        place = f'x="{at:.1f}" y="{bottom + 16}" text-anchor="middle"'
+        out.append(f'<text class="tick" {place}>{_abbreviate(value)}</text>')
     return out
 
 
-def _short(value: float) -> str:
+def _abbreviate(value: float) -> str:
     """Abbreviate a count or duration: 1500000 → 1.5M."""
     for size, unit in ((1e6, "M"), (1e3, "k")):
         if abs(value) >= size:
@@ -174,7 +173,7 @@ def _short(value: float) -> str:
     return f"{value:g}"
 
 
-def _caption(x_label: str, y_label: str) -> str:
+def _draw_captions(x_label: str, y_label: str) -> str:
     middle = (_LEFT + _WIDTH - _RIGHT) / 2
     up = (_TOP + _HEIGHT - _BOTTOM) / 2
     return (
@@ -184,7 +183,7 @@ def _caption(x_label: str, y_label: str) -> str:
     )
 
 
-def _front(points: Sequence[Point], x: _Axis, y: _Axis) -> str:
+def _draw_front(points: Sequence[Point], x: _Axis, y: _Axis) -> str:
     """Draw the front as a staircase: between two points the left one is still the best."""
     corners = [f"{x(points[0].x):.1f},{y(points[0].y):.1f}"]
     for before, after in pairwise(points):
@@ -194,7 +193,7 @@ def _front(points: Sequence[Point], x: _Axis, y: _Axis) -> str:
     return f'<polyline class="front" points="{" ".join(corners)}"/>'
 
 
-def _lines(points: Sequence[Point], x: _Axis, y: _Axis) -> list[str]:
+def _draw_lines(points: Sequence[Point], x: _Axis, y: _Axis) -> list[str]:
     groups: dict[tuple[int, int], list[Point]] = {}
     for point in points:
         groups.setdefault((point.series, point.mark), []).append(point)
@@ -205,14 +204,14 @@ def _lines(points: Sequence[Point], x: _Axis, y: _Axis) -> list[str]:
     return out
 
 
-def _dot(point: Point, x: float, y: float) -> str:
+def _draw_dot(point: Point, x: float, y: float) -> str:
     css = f"dot s{point.series}" + (f" m{point.mark}" if point.mark else "")
     return (
         f'<circle class="{css}" cx="{x:.1f}" cy="{y:.1f}" r="5"><title>{escape(point.text)}</title></circle>'
     )
 
 
-def _names(points: Sequence[Point], x: _Axis, y: _Axis) -> list[str]:
+def _draw_names(points: Sequence[Point], x: _Axis, y: _Axis) -> list[str]:
     """Place labels beside their dots, best first; skip labels that would overlap another."""
     out: list[str] = []
     taken: list[tuple[float, float, float]] = []
@@ -234,7 +233,7 @@ def _names(points: Sequence[Point], x: _Axis, y: _Axis) -> list[str]:
     return out
 
 
-def side_by_side(charts: Sequence[tuple[str, str]]) -> str:
+def place_side_by_side(charts: Sequence[tuple[str, str]]) -> str:
     """Return HTML of (caption, svg) charts side by side."""
     figures = (
         f"<figure>{svg}<figcaption>{escape(caption)}</figcaption></figure>" for caption, svg in charts if svg
@@ -242,7 +241,7 @@ def side_by_side(charts: Sequence[tuple[str, str]]) -> str:
     return f'<div class="row">{"".join(figures)}</div>'
 
 
-def legend(series: Sequence[str], marks: Sequence[str] = ()) -> str:
+def draw_legend(series: Sequence[str], marks: Sequence[str] = ()) -> str:
     """Return the legend of colours (methods), and of marks with their names."""
     items = [
         f'<span><i class="s{i % len(COLORS)}"></i>{escape(name)}</span>' for i, name in enumerate(series)

@@ -19,10 +19,10 @@ from g2ard.rendering.metrics import psnr
 from g2ard.rendering.renderer import Renderer
 from g2ard.rendering.sky import over_sky, seen_on_sky
 from g2ard.rendering.targets import Targets, mask_of
-from g2ard.report.labels import DENSE, RESULT, TARGET, labels_of
+from g2ard.report.labels import DENSE, RESULT, TARGET, label_scenes
 from g2ard.report.page import Page, Shown
-from g2ard.report.run import COLUMNS, LOST, KindScore, RunReport, rows_of
-from g2ard.report.sheet import contact_sheet
+from g2ard.report.run import COLUMNS, LOST, KindScore, RunReport, list_rows
+from g2ard.report.sheet import draw_contact_sheet
 from g2ard.scene.cameras import Camera, Cameras, rows_by_kind
 from g2ard.scene.splats import Splats
 from g2ard.stages.evaluate import ViewScore
@@ -58,8 +58,8 @@ class Drawn:
     def __init__(self, best: Targets, parts: Sequence[Targets]) -> None:
         self.best = best
         self.parts = parts
-        self._shown = set(map(_key, best.cameras))
-        self._scored = {_key(view): view.kind for part in parts for view in part.cameras}
+        self._shown = set(map(_identify, best.cameras))
+        self._scored = {_identify(view): view.kind for part in parts for view in part.cameras}
         self._worst: dict[str, list[tuple[float, _Key]]] = {kind: [] for kind in self._scored.values()}
         self._kept: dict[_Key, dict[str, tuple[NDArray[np.uint8], float]]] = {}
 
@@ -67,7 +67,7 @@ class Drawn:
         self, scene: str, targets: Targets, view: int, score: ViewScore, image: NDArray[np.float32]
     ) -> None:
         """Keep a scene's picture and PSNR if the report may show the view; the result is scored first."""
-        key = _key(targets.cameras[view])
+        key = _identify(targets.cameras[view])
         wanted = key in self._shown or key in self._kept
         if scene == RESULT and key in self._scored:
             worst = self._worst[score.kind]
@@ -79,22 +79,22 @@ class Drawn:
             self._kept = {other: kept for other, kept in self._kept.items() if other not in gone}
             wanted = key not in gone
         if wanted:
-            self._kept.setdefault(key, {})[scene] = to_bytes(scored(image, targets, view)), score.psnr
+            self._kept.setdefault(key, {})[scene] = to_bytes(grey_unscored(image, targets, view)), score.psnr
 
     def of(self, targets: Targets, view: int) -> Mapping[str, tuple[NDArray[np.uint8], float]]:
         """Return the picture and PSNR of each scene that is kept of a view."""
-        return self._kept.get(_key(targets.cameras[view]), {})
+        return self._kept.get(_identify(targets.cameras[view]), {})
 
 
 _Key = tuple[bytes, bytes, int, int]
 
 
-def _key(view: Camera) -> _Key:
+def _identify(view: Camera) -> _Key:
     """Return what a render depends on; views of other kinds may have the name of a given one."""
     return view.viewmat.tobytes(), view.K.tobytes(), view.width, view.height
 
 
-def pictures(
+def draw_pictures(
     targets: Targets,
     view: int,
     renderers: Mapping[str, Renderer],
@@ -117,7 +117,7 @@ def pictures(
         if name in known:
             return known[name]
         image = rendered(renderers[name], targets, view)
-        return to_bytes(scored(image, targets, view)), psnr(image, target, mask)
+        return to_bytes(grey_unscored(image, targets, view)), psnr(image, target, mask)
 
     shown, psnrs = map(list, zip(*map(shown_of, renderers), strict=True))
     if on_white is not None:
@@ -125,16 +125,16 @@ def pictures(
         light = (on_white(targets.cameras.take([view]))[0] - target).mean(axis=2)
         target = over_sky(target, np.clip(light, 0, 1))
         renders = [seen_on_sky(renderer.render(camera)) for renderer in renderers.values()]
-        shown = [to_bytes(scored(image, targets, view)) for image in renders]
-    return Pictures(targets.cameras.names[view], to_bytes(scored(target, targets, view)), shown, psnrs)
+        shown = [to_bytes(grey_unscored(image, targets, view)) for image in renders]
+    return Pictures(targets.cameras.names[view], to_bytes(grey_unscored(target, targets, view)), shown, psnrs)
 
 
-def renderers_of(scenes: Sequence[tuple[str, Splats]], background: Colour = BLACK) -> dict[str, Renderer]:
+def create_renderers(scenes: Sequence[tuple[str, Splats]], background: Colour = BLACK) -> dict[str, Renderer]:
     """Return a renderer for each scene by its name."""
     return {name: Renderer(splats, background=background) for name, splats in scenes}
 
 
-def distill_report(
+def write_distill_report(
     path: Path,
     title: str,
     renderers: Mapping[str, Renderer],
@@ -155,11 +155,11 @@ def distill_report(
         drawn: its parts are the targets of the held-out views, and of the views of other kinds, if any.
         told: summary lines that the command prints.
         best: a view that shows most of the scene.
-        on_white: see `pictures`.
+        on_white: see `draw_pictures`.
         command: the command line of the run.
         files: text of links → files of the run, relative to the page; the first is the scene.
     """
-    page = Page(title, verdict(report))
+    page = Page(title, summarize_run(report))
     if files:
         page.links(files, f"{report.sizes}: ")
     views = [(part, row) for part in drawn.parts for row in range(len(part.cameras))]
@@ -184,23 +184,23 @@ def distill_report(
     )
     show(best)
     page.heading("Scores")
-    page.table(COLUMNS, rows_of(report))
+    page.table(COLUMNS, list_rows(report))
     below = ", below the first row" if report.own_size else ""
     page.paragraph(f"PSNR and SSIM: {report.stages}, in views of {report.size}{below}.")
-    if edges := edges_line(report.kinds):
+    if edges := describe_edges(report.kinds):
         page.paragraph(edges)
     for line in told:
         page.paragraph(line, warns=line.startswith("warning"))
-    lost = _below_start(before, after)
+    lost = _find_worsened(before, after)
     if lost:
         page.paragraph(f"Views that ended below their start: {', '.join(text for _, text in lost)}.")
-    shown = list(dict.fromkeys([*(row for row, _ in lost[:1]), *_worst(after)]))[:_SHOWN]
+    shown = list(dict.fromkeys([*(row for row, _ in lost[:1]), *_choose_worst(after)]))[:_SHOWN]
     shown.sort(key=lambda row: after[row].psnr)
     worst = [view for view in shown if after[view].name != best.name]
     if worst:
         page.heading("Worst views")
     for view in worst:
-        show(pictures(*views[view], renderers, on_white, drawn))
+        show(draw_pictures(*views[view], renderers, on_white, drawn))
     page.paragraph(
         f"Made in {report.seconds['total']:,.0f} s. Scored against {report.against} in views that were not "
         f"trained on, which blend {report.overdraw:.1f} Gaussians per pixel."
@@ -225,7 +225,7 @@ _ADAPT = "g2ard adapt {} --views photos/ -o adapted.ply          # colours of ot
 """Commands for a result, and one for all but scans without photos."""
 
 
-def edges_line(kinds: Sequence[KindScore]) -> str | None:
+def describe_edges(kinds: Sequence[KindScore]) -> str | None:
     """Return the scores of thin structures, None without them."""
     found = [
         f"{kind.kind} {kind.edge_psnr.before:.2f} → {kind.edge_psnr.after:.2f} dB"
@@ -235,7 +235,7 @@ def edges_line(kinds: Sequence[KindScore]) -> str | None:
     return f"Edges, wires and text (PSNR of gradients): {', '.join(found)}." if found else None
 
 
-def verdict(report: RunReport) -> str:
+def summarize_run(report: RunReport) -> str:
     """Summarise a run in one sentence.
 
     >>> from types import SimpleNamespace
@@ -244,7 +244,7 @@ def verdict(report: RunReport) -> str:
     >>> kinds = [KindScore("near", 12, change, change, "near_0003", change, 0)]
     >>> made, size = "500 of 5,000 Gaussians", "800×600 px"
     >>> report = SimpleNamespace(kinds=kinds, made=made, size=size, against="photos", own_size=None)
-    >>> verdict(report)  # doctest: +ELLIPSIS
+    >>> summarize_run(report)  # doctest: +ELLIPSIS
     '500 of 5,000 Gaussians reproduce the photos at 36.6 dB, the mean of 12 held-out views of 800×600 px; ...'
     """
     kinds = report.kinds
@@ -265,11 +265,11 @@ def verdict(report: RunReport) -> str:
     return f"{report.made} reproduce the {what} at {at}; {last}."
 
 
-def _below_start(before: Sequence[ViewScore], after: Sequence[ViewScore]) -> list[tuple[int, str]]:
+def _find_worsened(before: Sequence[ViewScore], after: Sequence[ViewScore]) -> list[tuple[int, str]]:
     """Return the views whose PSNR fell by over `LOST`, most first, with a text on each.
 
     >>> rows = [ViewScore(name, 30.0) for name in "ab"]
-    >>> _below_start(rows, [ViewScore("a", 31.0), ViewScore("b", 29.0)])
+    >>> _find_worsened(rows, [ViewScore("a", 31.0), ViewScore("b", 29.0)])
     [(1, 'b 30.00 → 29.00 dB')]
     """
     falls = [old.psnr - new.psnr for old, new in zip(before, after, strict=True)]
@@ -278,7 +278,7 @@ def _below_start(before: Sequence[ViewScore], after: Sequence[ViewScore]) -> lis
     return list(zip(rows, texts, strict=True))
 
 
-def _worst(scores: Sequence[ViewScore]) -> list[int]:
+def _choose_worst(scores: Sequence[ViewScore]) -> list[int]:
     """Return views to show: the worst of each kind in turn, weakest kind first."""
     found = rows_by_kind([view.kind for view in scores])
     kinds = [sorted(rows, key=lambda row: scores[row].psnr) for rows in found.values()]
@@ -286,7 +286,7 @@ def _worst(scores: Sequence[ViewScore]) -> list[int]:
     return [row for turn in zip_longest(*kinds) for row in turn if row is not None][:_SHOWN]
 
 
-def preview(path: Path, drawn: Sequence[Pictures], scenes: Sequence[tuple[str, Splats]]) -> None:
+def write_preview(path: Path, drawn: Sequence[Pictures], scenes: Sequence[tuple[str, Splats]]) -> None:
     """Write a PNG with a row for each view: target, then each scene with its PSNR.
 
     Small images are enlarged, so that the picture is at least 1,200 pixels wide.
@@ -300,11 +300,11 @@ def preview(path: Path, drawn: Sequence[Pictures], scenes: Sequence[tuple[str, S
         ", ".join([view.name, *(f"{n} {p:.2f} dB" for n, p in zip(names, view.psnrs, strict=True))])
         for view in drawn
     ]
-    labels = [TARGET, *labels_of(names, [len(splats) for _, splats in scenes])]
-    write_png(path, contact_sheet(rows, labels, row_labels=captions), overwrite=True)
+    labels = [TARGET, *label_scenes(names, [len(splats) for _, splats in scenes])]
+    write_png(path, draw_contact_sheet(rows, labels, row_labels=captions), overwrite=True)
 
 
-def scored(image: NDArray[np.float32], targets: Targets, view: int) -> NDArray[np.float32]:
+def grey_unscored(image: NDArray[np.float32], targets: Targets, view: int) -> NDArray[np.float32]:
     """Return an image of a view with the pixels that are not scored in grey."""
     mask = mask_of(targets, view)
     return image if mask is None else np.where(mask[..., None], image, _UNSCORED)

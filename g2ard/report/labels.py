@@ -26,16 +26,16 @@ _GENERIC = re.compile(
 """File and folder names that do not say which scene it is."""
 
 
-def names_of(paths: Sequence[Path]) -> list[str]:
+def name_scenes(paths: Sequence[Path]) -> list[str]:
     """Return names of files or folders, with as many of their folders as tell which scene each one is.
 
-    >>> names_of([Path("garden.ply")]), names_of([Path("park/0_0")]), names_of([Path("run/scene.sog")])
-    (['garden.ply'], ['park/0_0'], ['run/scene.sog'])
-    >>> names_of([Path("a/small.ply"), Path("b/small.ply")])
+    >>> [name_scenes([Path(one)]) for one in ("garden.ply", "park/0_0", "run/scene.sog")]
+    [['garden.ply'], ['park/0_0'], ['run/scene.sog']]
+    >>> name_scenes([Path("a/small.ply"), Path("b/small.ply")])
     ['a/small.ply', 'b/small.ply']
     """
     rows = [Path(os.path.abspath(path)).parts for path in paths]
-    depths = {row: _depth(row) for row in rows}
+    depths = {row: _find_depth(row) for row in rows}
     while True:
         names = {row: "/".join(row[-depth:]) for row, depth in depths.items()}
         times = Counter(names.values())
@@ -46,32 +46,34 @@ def names_of(paths: Sequence[Path]) -> list[str]:
             depths[row] += 1
 
 
-def _depth(parts: tuple[str, ...]) -> int:
+def _find_depth(parts: tuple[str, ...]) -> int:
     """Return how many parts of a path, from the last one, hold a name that is not generic."""
     last = max(1, len(parts) - 1)
     told = (depth for depth in range(1, last) if not _GENERIC.fullmatch(parts[-depth].split(".")[0]))
     return next(told, last)
 
 
-def counted(count: int, scene: Source | str) -> str:
+def count_content(count: int, scene: Source | str) -> str:
     """Return a number of points, if the scene is the file of a point cloud, otherwise of Gaussians."""
     return plural(count, "point" if isinstance(scene, Source) and scene.kind == "points" else "Gaussian")
 
 
-def labels_of(scenes: Sequence[Source | str], counts: Sequence[int], roles: Sequence[str] = ()) -> list[str]:
+def label_scenes(
+    scenes: Sequence[Source | str], counts: Sequence[int], roles: Sequence[str] = ()
+) -> list[str]:
     """Return a label for each scene: its role if there are roles, its name and its size.
 
     Args:
         scenes: files, or names of scenes without one.
 
-    >>> labels_of(["small", "dense"], [1, 2000])
+    >>> label_scenes(["small", "dense"], [1, 2000])
     ['small: 1 Gaussian', 'dense: 2,000 Gaussians']
-    >>> labels_of(["garden"], [2000], [DENSE])
+    >>> label_scenes(["garden"], [2000], [DENSE])
     ['dense scene: garden, 2,000 Gaussians']
     """
-    names = iter(names_of([scene.path for scene in scenes if isinstance(scene, Source)]))
+    names = iter(name_scenes([scene.path for scene in scenes if isinstance(scene, Source)]))
     named = [next(names) if isinstance(scene, Source) else scene for scene in scenes]
-    sizes = [counted(count, scene) for count, scene in zip(counts, scenes, strict=True)]
+    sizes = [count_content(count, scene) for count, scene in zip(counts, scenes, strict=True)]
     if not roles:
         return [f"{name}: {size}" for name, size in zip(named, sizes, strict=True)]
     return [f"{role}: {name}, {size}" for role, name, size in zip(roles, named, sizes, strict=True)]

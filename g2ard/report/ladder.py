@@ -12,8 +12,8 @@ from g2ard.io.images import to_bytes
 from g2ard.rendering.exposure import rendered
 from g2ard.rendering.renderer import RasterSettings, Renderer
 from g2ard.rendering.targets import Targets
-from g2ard.report.charts import STYLE, Point, chart, legend
-from g2ard.report.distilled import scored
+from g2ard.report.charts import STYLE, Point, draw_chart, draw_legend
+from g2ard.report.distilled import grey_unscored
 from g2ard.report.page import Page, Shown
 from g2ard.scene.splats import Splats
 from g2ard.stages.evaluate import Evaluation, ViewScore, evaluate
@@ -58,26 +58,28 @@ class Dense:
     bytes: int
 
 
-def labels(names: Sequence[str], counts: Sequence[int], dense: int | None) -> list[str]:
+def label_sizes(names: Sequence[str], counts: Sequence[int], dense: int | None) -> list[str]:
     """Return a short name for each size: the ratio to the dense scene, the count, or the file's name.
 
-    >>> labels(["a", "b"], [100_000, 33_333], 1_000_000), labels("abc", [9, 20_000, 1_234_567], None)
-    (['10×', '30×'], ['9', '20k', '1.23M'])
-    >>> labels(["a.ply", "a.sog"], [100, 100], 1000)
+    >>> label_sizes(["a", "b"], [100_000, 33_333], 1_000_000)
+    ['10×', '30×']
+    >>> label_sizes("abc", [9, 20_000, 1_234_567], None)
+    ['9', '20k', '1.23M']
+    >>> label_sizes(["a.ply", "a.sog"], [100, 100], 1000)
     ['a.ply', 'a.sog']
     """
-    found = [_short(n) if dense is None else f"{dense / n:.3g}×" for n in counts]
+    found = [_abbreviate(n) if dense is None else f"{dense / n:.3g}×" for n in counts]
     return list(names) if len(set(found)) < len(found) else found
 
 
-def _short(count: int) -> str:
+def _abbreviate(count: int) -> str:
     for size, unit in ((1e6, "M"), (1e3, "k")):
         if count >= size:
             return f"{count / size:.3g}{unit}"
     return str(count)
 
 
-def recommendation(rungs: Sequence[Rung]) -> str:
+def recommend_size(rungs: Sequence[Rung]) -> str:
     """Return one sentence on the smallest result that suffices; `rungs` are sorted by size, smallest first.
 
     Against renders of the dense scene no view may lose detail visibly. Against photos the mean may be 1 dB
@@ -105,7 +107,7 @@ def recommendation(rungs: Sequence[Rung]) -> str:
     return text + ("; fewer Gaussians may do" if found is rungs[0] else "")
 
 
-def ladder(
+def write_ladder(
     path: Path,
     title: str,
     rungs: Sequence[Rung],
@@ -125,12 +127,12 @@ def ladder(
         best: targets whose first view shows most of the scene.
         dense: the scene that they were made from; None without one.
     """
-    advice = recommendation(rungs)
+    advice = recommend_size(rungs)
     page = Page(title, f"{advice[0].upper()}{advice[1:]}.")
     page.html(STYLE)
-    page.html(f'<div class="row"><figure>{_plot(rungs)}</figure></div>')
-    page.html(legend(["mean", "worst view"]))
-    page.table(_COLUMNS, _rows(rungs, dense))
+    page.html(f'<div class="row"><figure>{_draw_plot(rungs)}</figure></div>')
+    page.html(draw_legend(["mean", "worst view"]))
+    page.table(_COLUMNS, _list_rows(rungs, dense))
     page.paragraph(
         f"Scored in {rungs[0].scores.scored_in}. Detail lost: contrast that the worst regions "
         f"of a view lack; people see it from {_VISIBLE:.0f} on."
@@ -140,10 +142,14 @@ def ladder(
 
     def show(title: str, part: Targets, row: int, psnrs: Sequence[float]) -> None:
         shown = [
-            Shown(rung.label, to_bytes(scored(rendered(renderer, part, row), part, row)), f"{psnr:.2f} dB")
+            Shown(
+                rung.label,
+                to_bytes(grey_unscored(rendered(renderer, part, row), part, row)),
+                f"{psnr:.2f} dB",
+            )
             for rung, renderer, psnr in zip(rungs, renderers, psnrs, strict=True)
         ]
-        page.comparison(title, to_bytes(scored(part[row], part, row)), shown)
+        page.comparison(title, to_bytes(grey_unscored(part[row], part, row)), shown)
 
     page.heading("The same view")
     show(best.cameras.names[0], best, 0, [score(rung.splats).views[0].psnr for rung in rungs])
@@ -158,14 +164,18 @@ def ladder(
 _COLUMNS = ("scene", "size", "Gaussians", "MB", "PSNR, dB", "worst view", "detail lost", "SSIM")
 
 
-def _rows(rungs: Sequence[Rung], dense: Dense | None) -> list[list[str]]:
-    top = [] if dense is None else [[dense.name, "1×", f"{dense.count:,}", _mb(dense.bytes), *[""] * 4]]
+def _list_rows(rungs: Sequence[Rung], dense: Dense | None) -> list[list[str]]:
+    top = (
+        []
+        if dense is None
+        else [[dense.name, "1×", f"{dense.count:,}", _format_megabytes(dense.bytes), *[""] * 4]]
+    )
     return top + [
         [
             rung.name,
             rung.label,
             f"{rung.scores.count:,}",
-            _mb(rung.bytes),
+            _format_megabytes(rung.bytes),
             f"{rung.scores.psnr:.2f}",
             f"{rung.worst.name} {rung.worst.psnr:.2f}",
             f"{rung.worst.lost:.2f}",
@@ -175,15 +185,15 @@ def _rows(rungs: Sequence[Rung], dense: Dense | None) -> list[list[str]]:
     ]
 
 
-def _mb(size: int) -> str:
+def _format_megabytes(size: int) -> str:
     return f"{size / 1e6:.2f}"
 
 
-def _plot(rungs: Sequence[Rung]) -> str:
+def _draw_plot(rungs: Sequence[Rung]) -> str:
     """Draw mean and worst PSNR against size."""
     points = []
     for rung in rungs:
         for series, psnr in enumerate((rung.scores.psnr, rung.worst.psnr)):
-            text = f"{rung.name}: {psnr:.2f} dB, {_mb(rung.bytes)} MB"
+            text = f"{rung.name}: {psnr:.2f} dB, {_format_megabytes(rung.bytes)} MB"
             points.append(Point(rung.bytes / 1e6, psnr, series, text=text, label=rung.label))
-    return chart(points, x_label="MB", y_label="PSNR, dB", log=True, joined=True)
+    return draw_chart(points, x_label="MB", y_label="PSNR, dB", log=True, joined=True)

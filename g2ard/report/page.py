@@ -38,22 +38,22 @@ Window = tuple[float, float, float, float]
 """Left, top, width and height of a rectangle of an image, as fractions of its width and height."""
 
 
-def pixels(window: Window, height: int, width: int) -> tuple[slice, slice]:
+def slice_window(window: Window, height: int, width: int) -> tuple[slice, slice]:
     """Return the rows and columns of a window in an image of that size, at least one of each.
 
-    >>> pixels((0.25, 0.5, 0.25, 0.25), 100, 200)
+    >>> slice_window((0.25, 0.5, 0.25, 0.25), 100, 200)
     (slice(50, 75, None), slice(50, 100, None))
     """
     left, top, across, down = window
-    return _span(top, down, height), _span(left, across, width)
+    return _slice_span(top, down, height), _slice_span(left, across, width)
 
 
-def _span(start: float, extent: float, size: int) -> slice:
+def _slice_span(start: float, extent: float, size: int) -> slice:
     first = min(int(start * size + 1e-6), size - 1)
     return slice(first, max(first + 1, min(size, round((start + extent) * size))))
 
 
-def worst_windows(image: NDArray[np.uint8], target: NDArray[np.uint8]) -> list[Window]:
+def find_worst_windows(image: NDArray[np.uint8], target: NDArray[np.uint8]) -> list[Window]:
     """Return the windows with the largest error, worst first, in shares of the image's size."""
     error = ((image.astype(np.float64) - target) ** 2).sum(-1)
     height, width = error.shape
@@ -143,7 +143,7 @@ class Page:
         """
         number = self._image(target)
         numbers = [self._image(one.image) for one in shown]
-        windows = worst_windows(shown[0].image, target)
+        windows = find_worst_windows(shown[0].image, target)
         height, width = target.shape[:2]
         options = "".join(
             f'<option value="{n}">{escape(s.name)} {escape(s.caption)}</option>'
@@ -171,7 +171,7 @@ class Page:
         )
 
     def _crop(self, shown: Shown, window: Window) -> str:
-        rows, columns = pixels(window, *shown.image.shape[:2])
+        rows, columns = slice_window(window, *shown.image.shape[:2])
         crop = shown.image[rows, columns]
         number = self._image(crop)
         ratio = crop.shape[1] / crop.shape[0]

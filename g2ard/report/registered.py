@@ -27,7 +27,7 @@ _SIZE = 640
 _LINES = 80  # matches drawn per photo
 
 
-def registration_report(
+def write_registration_report(
     path: Path,
     title: str,
     scene: Splats,
@@ -51,7 +51,7 @@ def registration_report(
     for line in told:
         page.paragraph(line)
     columns = ["photo", "status", "ZNCC", "σ position", "σ rotation, °", "error", "error, °", "why"]
-    table = [columns, *map(_cells, found.report.photos)]
+    table = [columns, *map(_list_cells, found.report.photos)]
     names, *cells = zip(*(column for column in zip(*table, strict=True) if any(column[1:])), strict=True)
     page.table(names, cells)
     page.heading("Least alike first")
@@ -74,13 +74,13 @@ def registration_report(
         matches = found.matches.get(row.name)
         if matches is not None:
             scale = photo.shape[1] / cameras.take([i]).resized(side)[0].width
-            drawn = _matches_drawn(photo, render, matches * scale)
+            drawn = _draw_matches(photo, render, matches * scale)
             count = plural(len(matches), "match", "matches")
             page.figure(drawn, f"{count} explained by the pose; at most {_LINES} are drawn")
     page.write(path, overwrite)
 
 
-def _matches_drawn(
+def _draw_matches(
     photo: NDArray[np.uint8], render: NDArray[np.uint8], matches: NDArray[np.float64]
 ) -> NDArray[np.uint8]:
     """Draw photo and render side by side, with a line for each match, (M, 4) pixels u, v of both."""
@@ -98,7 +98,7 @@ def _matches_drawn(
     return np.asarray(pair)
 
 
-def _cells(row: PhotoReport) -> list[str]:
+def _list_cells(row: PhotoReport) -> list[str]:
     def number(value: float | None) -> str:
         return "" if value is None else f"{value:.3g}"
 

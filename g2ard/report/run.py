@@ -60,13 +60,13 @@ class KindScore(Report):
     detail: Change | None = None
 
 
-def by_kind(
+def summarize_by_kind(
     before: Sequence[ViewScore], after: Sequence[ViewScore], usual: str = USUAL
 ) -> tuple[KindScore, ...]:
     """Summarise scores of views before and after recovery by kind of view; `usual` names the usual kind.
 
     >>> before, after = (ViewScore("near_0000", psnr, kind="near") for psnr in (30.0, 31.0))
-    >>> found, = by_kind([before], [after])
+    >>> found, = summarize_by_kind([before], [after])
     >>> found.kind, found.psnr.gain, found.ssim, found.worst
     ('near', 1.0, None, 'near_0000')
     """
@@ -104,7 +104,7 @@ def by_kind(
 COLUMNS = ("kind of view", "views", "PSNR, dB", "worst", "detail", "SSIM")
 
 
-def cells(kinds: Iterable[KindScore]) -> list[list[str]]:
+def list_cells(kinds: Iterable[KindScore]) -> list[list[str]]:
     """Return the rows of a table with `COLUMNS`."""
     return [
         [
@@ -119,10 +119,10 @@ def cells(kinds: Iterable[KindScore]) -> list[list[str]]:
     ]
 
 
-def rows_of(report: RunReport) -> list[list[str]]:
+def list_rows(report: RunReport) -> list[list[str]]:
     """Return the rows of a run's table, the views' own size first if another one was requested."""
     if report.own_size is None:
-        return cells(report.kinds)
+        return list_cells(report.kinds)
     before, after = (report.own_size[name] for name in ("simplified", "recovered"))
     first = [
         "full size",
@@ -132,10 +132,10 @@ def rows_of(report: RunReport) -> list[list[str]]:
         "–" if math.isnan(after.detail) else f"{before.detail:.2f} → {after.detail:.2f}",
         f"{before.ssim:.4f} → {after.ssim:.4f}",
     ]
-    return [first, *cells(report.kinds)]
+    return [first, *list_cells(report.kinds)]
 
 
-def sizes_of(report: RunReport) -> str:
+def describe_sizes(report: RunReport) -> str:
     """Return the size of a run's held-out views, and their own if another one was requested."""
     if report.own_size is None:
         return report.size

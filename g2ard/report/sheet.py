@@ -13,7 +13,7 @@ from g2ard.io.images import to_bytes
 _SHEET_GAP = 6  # pixels between the images of a contact sheet
 
 
-def contact_sheet(
+def draw_contact_sheet(
     rows: Sequence[Sequence[ArrayLike]], labels: Sequence[str], *, row_labels: Sequence[str] = ()
 ) -> NDArray[np.uint8]:
     """Arrange images of any sizes in a grid on a dark background: a row per view, a column per kind.

@@ -11,7 +11,7 @@ import pytest
 from g2ard.cli.run_folder import RunFolder
 from g2ard.rendering.renderer import Renderer
 from g2ard.rendering.targets import TeacherRenders
-from g2ard.report.distilled import Drawn, pictures, renderers_of
+from g2ard.report.distilled import Drawn, create_renderers, draw_pictures
 from g2ard.report.labels import RESULT
 from g2ard.stages.evaluate import evaluate
 from helpers.commands import CommandLine, succeeds
@@ -66,8 +66,11 @@ def test_kept_pictures_are_those_that_would_be_rendered(monkeypatch: pytest.Monk
     worst = sorted(range(6), key=lambda view: tables[0].views[view].psnr)
     kept = [view for view in range(6) if drawn.of(targets, view)]
     assert kept == sorted({4, *worst[:3]})
-    renderers = renderers_of(list(scenes.items()))
+    renderers = create_renderers(list(scenes.items()))
     for view in kept:
-        ours, anew = pictures(targets, view, renderers, drawn=drawn), pictures(targets, view, renderers)
+        ours, anew = (
+            draw_pictures(targets, view, renderers, drawn=drawn),
+            draw_pictures(targets, view, renderers),
+        )
         assert ours.psnrs == anew.psnrs == [table.views[view].psnr for table in tables]
         np.testing.assert_array_equal(ours.images, anew.images)

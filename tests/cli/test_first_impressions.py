@@ -10,7 +10,7 @@ import pytest
 
 import g2ard
 from g2ard.cli.app import COMMANDS
-from g2ard.cli.resume import say_from
+from g2ard.cli.resume import tell_start
 from g2ard.errors import OutputError
 from g2ard.scene.transform import change_of_axes
 from helpers.commands import CommandLine, refused, succeeds
@@ -124,5 +124,5 @@ def test_progress_and_summary_use_the_same_words(tmp_path: Path) -> None:
     assert {"targets", "simplify", "recover"} <= stages  # as in the seconds of the summary
     assert not {"teacher", "rates"} & stages
     told: list[str] = []
-    say_from(SimpleNamespace(say=told.append), tmp_path / "work", Path("run"))  # type: ignore[arg-type]
+    tell_start(SimpleNamespace(say=told.append), tmp_path / "work", Path("run"))  # type: ignore[arg-type]
     assert re.fullmatch(r"run: continues (after [\w, -]+|from step \d+|after .* from step \d+)", told[0])

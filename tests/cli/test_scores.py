@@ -175,7 +175,7 @@ def test_every_score_has_its_size(runs: Path, command_line: CommandLine) -> None
 
 def test_a_size_that_harms_is_a_warning_with_the_way_out() -> None:
     """A loss above 3 dB at the views' own size is reported; a smaller one is not."""
-    from g2ard.cli.run_result import told
+    from g2ard.cli.run_result import list_remarks
 
     means = [
         SimpleNamespace(psnr=psnr, ssim=0.9, scored_in="8 photos, 800×600 px")
@@ -187,7 +187,7 @@ def test_a_size_that_harms_is_a_warning_with_the_way_out() -> None:
         own_size = {"simplified": before, "recovered": own}
         scores = {"recovered": at_size}
         report: Any = SimpleNamespace(rounds=[], kinds=[], own_size=own_size, scores=scores, **fields)
-        warnings = [line for line in told(report) if line.startswith("warning: ")]
+        warnings = [line for line in list_remarks(report) if line.startswith("warning: ")]
         assert bool(warnings) == warned
         assert all("7.5 dB" in line and "leave --size out" in line for line in warnings)
 

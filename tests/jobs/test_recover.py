@@ -9,7 +9,7 @@ import g2ard
 from g2ard.errors import InputError
 from g2ard.io import write_views
 from g2ard.jobs.recover import prepare
-from g2ard.stages.recover.config import steps_for
+from g2ard.stages.recover.config import count_steps_for_renders
 from helpers.commands import CommandLine, succeeds
 from helpers.photos import photographed
 from helpers.scenes import around, checkered_ball
@@ -61,7 +61,7 @@ def test_a_generated_pool_is_completed_for_the_student(folder: Path) -> None:
     assert job.held_out is not None
     assert job.held_out.cameras.kinds.count("usual") == 16
     assert set(job.validation.cameras.kinds) <= set(job.held_out.cameras.kinds)
-    assert job.config.steps == steps_for(student, job.views.cameras, 800)
+    assert job.config.steps == count_steps_for_renders(student, job.views.cameras, 800)
     names = [*job.views.cameras.names, *job.validation.cameras.names, *job.held_out.cameras.names]
     assert len(set(names)) == len(names)
     given = prepare(student, views=job.views, teacher=naive.statue(), size=32)

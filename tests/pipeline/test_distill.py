@@ -105,8 +105,8 @@ def test_command_on_a_trained_scene(command_line: CommandLine, tmp_path: Path) -
 
 
 def test_a_loss_in_any_kind_of_view_is_reported() -> None:
-    from g2ard.cli.run_result import loss, told
-    from g2ard.report.run import RunReport, by_kind
+    from g2ard.cli.run_result import describe_loss, list_remarks
+    from g2ard.report.run import RunReport, summarize_by_kind
     from g2ard.stages.evaluate import ViewScore
 
     def said(usual: float, near: float | None, unseen: float | None, ssim: float = 0.0) -> list[str]:
@@ -116,8 +116,8 @@ def test_a_loss_in_any_kind_of_view_is_reported() -> None:
                 view = ViewScore(f"{kind}_{i}", 30.0, 0.9, kind=kind)
                 before.append(view)
                 after.append(replace(view, psnr=30.0 + share * gain, ssim=0.9 + ssim))
-        found = {"rounds": (), "kinds": by_kind(before, after), "unseen": unseen}
-        return told(RunReport(**{field.name: found.get(field.name) for field in fields(RunReport)}))
+        found = {"rounds": (), "kinds": summarize_by_kind(before, after), "unseen": unseen}
+        return list_remarks(RunReport(**{field.name: found.get(field.name) for field in fields(RunReport)}))
 
     assert said(1.0, None, None) == ["1 of 2 usual views lost PSNR; the mean of all 2 gained 1.00 dB"]
     assert said(0.02, 0.02, 0.0) == []
@@ -127,7 +127,7 @@ def test_a_loss_in_any_kind_of_view_is_reported() -> None:
     assert mixed == "recovery lost 0.004 SSIM and gained 0.30 dB in usual views"
     assert said(0.0, None, 0.0, ssim=-0.004)[0].startswith("warning: recovery lost 0.004 SSIM")
     before = [ViewScore("a", 15.0), ViewScore("b", 30.0)]
-    line = loss(by_kind(before, [ViewScore("a", 15.5), ViewScore("b", 29.0)])[0])
+    line = describe_loss(summarize_by_kind(before, [ViewScore("a", 15.5), ViewScore("b", 29.0)])[0])
     assert "recovery lost 0.25 dB in usual views (1 of 2 views lost PSNR)" in line  # the worst view gained
     lines = said(-0.2, -0.3, 0.25)
     assert "lost 0.20 dB in usual views" in lines[0]

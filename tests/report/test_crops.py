@@ -14,8 +14,8 @@ from PIL import Image
 from g2ard.io.images import to_bytes
 from g2ard.rendering.targets import TeacherRenders
 from g2ard.report import distilled
-from g2ard.report.page import Page, Shown, pixels, worst_windows
-from g2ard.report.sheet import contact_sheet
+from g2ard.report.page import Page, Shown, find_worst_windows, slice_window
+from g2ard.report.sheet import draw_contact_sheet
 from g2ard.stages.evaluate import evaluate
 from helpers.scenes import around, checkered_ball
 from helpers.studies import check_page
@@ -32,21 +32,21 @@ def test_worst_windows_hold_the_error_and_do_not_overlap() -> None:
     for _ in range(20):
         target = np.zeros((60, 80, 3), np.uint8)
         image = rng.integers(0, 255, target.shape, np.uint8)
-        first, second = worst_windows(image, target)
+        first, second = find_worst_windows(image, target)
         mask = np.zeros(target.shape[:2], int)
         for window in (first, second):
-            mask[pixels(window, 60, 80)] += 1
+            mask[slice_window(window, 60, 80)] += 1
         assert mask.max() == 1
         error = (image.astype(float) ** 2).sum(-1)
-        rows, columns = pixels(first, 60, 80)
+        rows, columns = slice_window(first, 60, 80)
         best = max(
             error[i : i + rows.stop - rows.start, j : j + columns.stop - columns.start].sum()
             for i in range(60 - (rows.stop - rows.start) + 1)
             for j in range(80 - (columns.stop - columns.start) + 1)
         )
         assert error[rows, columns].sum() == best
-        assert error[pixels(second, 60, 80)].sum() <= best
-    assert len(worst_windows(target[:1, :1], target[:1, :1])) == 1  # no room for a second
+        assert error[slice_window(second, 60, 80)].sum() <= best
+    assert len(find_worst_windows(target[:1, :1], target[:1, :1])) == 1  # no room for a second
 
 
 def test_crops_are_cut_at_full_resolution() -> None:
@@ -81,7 +81,9 @@ def test_the_preview_has_the_scores_of_the_table_and_greys_what_is_not_scored(
     ball, cameras = checkered_ball(200), around(2, (32, 24))
     shown: list[Any] = []
     monkeypatch.setattr(
-        distilled, "contact_sheet", lambda rows, _, row_labels: shown.extend([rows, row_labels]) or rows[0][0]
+        distilled,
+        "draw_contact_sheet",
+        lambda rows, _, row_labels: shown.extend([rows, row_labels]) or rows[0][0],
     )
     mask = np.zeros((24, 32), bool)
     mask[6:18, 8:24] = True
@@ -89,9 +91,9 @@ def test_the_preview_has_the_scores_of_the_table_and_greys_what_is_not_scored(
     monkeypatch.setattr(targets, "mask", lambda view: mask, raising=False)
     half = ball.take(range(100))
     scenes = [("half", half)]
-    renderers = distilled.renderers_of(scenes)
-    drawn = [distilled.pictures(targets, view, renderers) for view in range(2)]
-    distilled.preview(tmp_path / "preview.png", drawn, scenes)
+    renderers = distilled.create_renderers(scenes)
+    drawn = [distilled.draw_pictures(targets, view, renderers) for view in range(2)]
+    distilled.write_preview(tmp_path / "preview.png", drawn, scenes)
     rows, captions = shown
     table = evaluate(half, targets)
     assert captions == [f"{view.name}, half {view.psnr:.2f} dB" for view in table.views]
@@ -111,7 +113,9 @@ def test_words_of_a_sheet_have_room(width: int, monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr("PIL.ImageDraw.ImageDraw.text", text)
     rows = [[np.zeros((30, width, 3), np.uint8)] * 3] * 2
     labels = ["target", "simplified: 50,000 Gaussians", "result: 50,000 Gaussians"]
-    sheet = contact_sheet(rows, labels, row_labels=["0027.jpg, simplified 24.32 dB, result 34.61 dB"] * 2)
+    sheet = draw_contact_sheet(
+        rows, labels, row_labels=["0027.jpg, simplified 24.32 dB, result 34.61 dB"] * 2
+    )
     assert len(written) == 5
     assert all(end <= sheet.shape[1] for _, end in written)
     ends = [0.0, *(end for _, end in written[:3])]

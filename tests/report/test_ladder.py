@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 import g2ard
-from g2ard.report.ladder import Rung, recommendation
+from g2ard.report.ladder import Rung, recommend_size
 from g2ard.stages.evaluate import Evaluation, ViewScore
 from helpers.commands import CommandLine, refused, succeeds
 from helpers.photos import photographed
@@ -48,7 +48,7 @@ def rungs(*scores: tuple[float, float], against: str = "teacher") -> list[Rung]:
     ],
 )
 def test_the_smallest_size_that_suffices_is_recommended(given: list[Rung], told: str) -> None:
-    assert re.fullmatch(told, recommendation(given))
+    assert re.fullmatch(told, recommend_size(given))
 
 
 @pytest.mark.parametrize(

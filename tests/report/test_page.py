@@ -5,8 +5,8 @@ from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
-from g2ard.report.distilled import _worst, verdict
-from g2ard.report.run import RunReport, by_kind, rows_of, sizes_of
+from g2ard.report.distilled import _choose_worst, summarize_run
+from g2ard.report.run import RunReport, describe_sizes, list_rows, summarize_by_kind
 from g2ard.stages.evaluate import Means, ViewScore
 from helpers.commands import CommandLine, succeeds
 from helpers.studies import check_page, study
@@ -37,8 +37,8 @@ VIEWS = [
 
 
 def test_pictures_are_the_worst_view_of_each_kind_in_turn() -> None:
-    assert [VIEWS[row].name for row in _worst(VIEWS)] == ["near_1", "pose_1", "near_2"]
-    assert _worst(VIEWS[:1]) == [0]
+    assert [VIEWS[row].name for row in _choose_worst(VIEWS)] == ["near_1", "pose_1", "near_2"]
+    assert _choose_worst(VIEWS[:1]) == [0]
 
 
 def _report(**known: Any) -> RunReport:
@@ -47,18 +47,18 @@ def _report(**known: Any) -> RunReport:
 
 def test_the_verdict_names_the_weakest_kind_of_view() -> None:
     counts = {"input_count": 90, "output_count": 9, "size": "48×36 px"}
-    report = _report(**counts, against="renders", kinds=by_kind(VIEWS, VIEWS))
+    report = _report(**counts, against="renders", kinds=summarize_by_kind(VIEWS, VIEWS))
     told = "9 of 90 Gaussians reproduce the dense scene at 29.8 dB, the mean of 5 held-out views of 48×36 px"
-    assert verdict(report) == f"{told}; near views are weakest (27.0 dB)."
-    assert verdict(replace(report, kinds=())) == "9 Gaussians; no held-out view shows the scene."
-    of_photos = verdict(replace(report, lifted=True, against="photos"))
+    assert summarize_run(report) == f"{told}; near views are weakest (27.0 dB)."
+    assert summarize_run(replace(report, kinds=())) == "9 Gaussians; no held-out view shows the scene."
+    of_photos = summarize_run(replace(report, lifted=True, against="photos"))
     assert of_photos.startswith("9 Gaussians from 90 points reproduce the photos at")
     full = Means(26.04, 0.8, 30, 0.9, "5 photos, 96×72 px")
-    told = verdict(replace(report, own_size={"recovered": full}))
+    told = summarize_run(replace(report, own_size={"recovered": full}))
     assert "at 26.0 dB in 5 photos, 96×72 px, the views' own size; at 29.8 dB, the mean of 5" in told
     sizes = {"simplified": replace(full, psnr=24.5), "recovered": full}
-    first, *others = rows_of(replace(report, own_size=sizes))
+    first, *others = list_rows(replace(report, own_size=sizes))
     assert first[:3] == ["full size", "5", "24.50 → 26.04"]
-    assert sizes_of(replace(report, own_size=sizes)) == f"{report.size} (full size: 96×72 px)"
-    assert others == rows_of(report)
-    assert rows_of(report)[0][0] == "usual"
+    assert describe_sizes(replace(report, own_size=sizes)) == f"{report.size} (full size: 96×72 px)"
+    assert others == list_rows(report)
+    assert list_rows(report)[0][0] == "usual"

@@ -28,9 +28,9 @@ from g2ard.stages.recover import loop, probe, trials
 from g2ard.stages.recover.anchors import REGULARIZERS, Anchors
 from g2ard.stages.recover.config import TUNED, RecoverConfig
 from g2ard.stages.recover.engine import FusedEngine
-from g2ard.stages.recover.guard import Guard, blended
+from g2ard.stages.recover.guard import Guard, blend
 from g2ard.stages.recover.optimize import recover
-from g2ard.stages.recover.report import cut_short, outcome
+from g2ard.stages.recover.report import describe_outcome, describe_time_limit
 from g2ard.stages.simplify import SimplifyConfig, simplify
 from g2ard.system import devices
 from helpers.gpus import skip_without_gpu
@@ -266,7 +266,7 @@ def test_trials_choose_rates_that_suit_the_scene(
     nearly = recover(TEACHER, targets, RecoverConfig(steps=100)).report  # nothing to gain: small steps
     assert nearly.multiplier == pytest.approx(1 / 3)
     rough = recover(student, targets, RecoverConfig(steps=100)).report  # of renders the error says enough
-    assert 1 / 3 < rough.multiplier == loop.multiplier_for(10 ** (-rough.psnr.before / 20))
+    assert 1 / 3 < rough.multiplier == loop.guess_multiplier(10 ** (-rough.psnr.before / 20))
     assert not rough.trials
     assert nearly.trials
     fixed = RecoverConfig(schedule=replace(TUNED, multiplier=0.7), steps=100)
@@ -350,9 +350,9 @@ def test_a_recovery_that_time_ends_says_what_it_missed(student: Splats, targets:
     assert done.pace == pytest.approx(100 * (after - before) / (done.steps - looked))
     gaining = f"it was still gaining {done.pace:.1f} dB" if done.pace >= 0.05 else "it gained under 0.05 dB"
     told = f"time ended recovery at step {done.steps} of {planned:,}; {gaining} per 100 steps"
-    assert cut_short(done) == told
+    assert describe_time_limit(done) == told
     long_enough = replace(config, schedule=replace(TUNED, steps=20))
-    assert cut_short(recover(student, targets, long_enough).report) is None
+    assert describe_time_limit(recover(student, targets, long_enough).report) is None
     unlimited = recover(student, targets, RecoverConfig(steps=20)).report
     assert (unlimited.planned, unlimited.pace) == (None, None)
 
@@ -404,7 +404,7 @@ def test_steps_that_lose_are_undone_and_made_smaller(targets: TeacherRenders) ->
     assert done.multiplier == pytest.approx(20 / 3 ** len(done.backed_off))
     assert done.psnr.after > done.psnr.before + 1
     assert not done.kept_start
-    told = outcome(done)
+    told = describe_outcome(done)
     assert told.startswith(f"recovery fell to {done.backed_off[0].psnr:.2f} dB (start ")
 
 
@@ -430,7 +430,7 @@ def test_a_hopeless_recovery_stops_early_and_says_so(targets: TeacherRenders) ->
     assert done.report.kept_start
     assert done.report.steps == done.report.stopped == 75
     assert_same_bits(done.splats, replace(start, quats=unit_quats(start.quats)))
-    told = outcome(done.report)
+    told = describe_outcome(done.report)
     assert told.startswith("kept the start: recovery fell to ")
     assert told.endswith("given up at step 75")
 
@@ -438,7 +438,7 @@ def test_a_hopeless_recovery_stops_early_and_says_so(targets: TeacherRenders) ->
 def test_a_change_that_ends_too_low_is_cut_back() -> None:
     ball = checkered_ball(50)
     end = replace(ball, means=ball.means + 4, quats=-ball.quats, scales=ball.scales * 16)
-    half = blended(ball, end, 0.5)
+    half = blend(ball, end, 0.5)
     np.testing.assert_allclose(half.means, ball.means + 2, rtol=1e-5)
     np.testing.assert_allclose(half.scales, ball.scales * 4, rtol=1e-5)
     norm = np.linalg.norm(ball.quats, axis=1, keepdims=True)
@@ -520,12 +520,12 @@ def test_training_views_vote_on_which_changes_were_harmful() -> None:
 
     alone, losing = sums(validation)
     together = alone + sums(asked)[0]
-    found = probe.harmful_changes(start, end, validation, training, (0, 0, 0))
+    found = probe.find_harmful_changes(start, end, validation, training, (0, 0, 0))
     assert found is not None
     clear = np.minimum(abs(losing), abs(together)) > 1e-3
     np.testing.assert_array_equal(found[clear], ((losing > 0) & (together > 0))[clear])
     assert (clear & ~found & (losing > 0) & (alone > 0)).any()
-    assert probe.harmful_changes(end, end, validation, training, (0, 0, 0)) is None
+    assert probe.find_harmful_changes(end, end, validation, training, (0, 0, 0)) is None
 
 
 def test_a_recovery_that_only_harms_validation_views_stops_at_half(targets: TeacherRenders) -> None:
@@ -538,7 +538,7 @@ def test_a_recovery_that_only_harms_validation_views_stops_at_half(targets: Teac
     assert_same_bits(done.splats, start)
     looks = done.report.validation.looks
     assert [found.step for found in looks] == [0, 50, 50, 50]
-    told = outcome(done.report)
+    told = describe_outcome(done.report)
     assert told.startswith("kept the start: every step made validation views worse (")
 
 

@@ -16,7 +16,7 @@ from g2ard.rendering.targets import TeacherRenders
 from g2ard.scene.splats import Splats
 from g2ard.stages.evaluate import evaluate
 from g2ard.stages.recover.config import RecoverConfig
-from g2ard.stages.recover.loop import checked_weights, drawn
+from g2ard.stages.recover.loop import check_weights, draw_views
 from g2ard.stages.recover.optimize import recover
 from g2ard.stages.simplify import simplify
 from helpers.commands import succeeds
@@ -40,24 +40,24 @@ def student() -> Splats:
 @settings(max_examples=60, deadline=None)
 @given(st.lists(st.floats(0, 1e300), min_size=1, max_size=40).filter(any), st.integers(0, 5))
 def test_every_epoch_draws_within_one_of_the_weights(raw: list[float], epoch: int) -> None:
-    weights = checked_weights(raw, len(raw))
-    counts = np.bincount(drawn(3, epoch, len(raw), weights), minlength=len(raw))
+    weights = check_weights(raw, len(raw))
+    counts = np.bincount(draw_views(3, epoch, len(raw), weights), minlength=len(raw))
     assert counts.sum() == len(raw)
     assert np.all(np.abs(counts - weights) < 1 + 1e-9)
     assert not counts[weights == 0].any()
 
 
 def test_many_epochs_draw_views_by_weight() -> None:
-    weights = checked_weights(np.random.default_rng(0).random(20) ** 3, 20)
-    counts = sum(np.bincount(drawn(1, epoch, 20, weights), minlength=20) for epoch in range(400))
+    weights = check_weights(np.random.default_rng(0).random(20) ** 3, 20)
+    counts = sum(np.bincount(draw_views(1, epoch, 20, weights), minlength=20) for epoch in range(400))
     np.testing.assert_allclose(counts / 400, weights, atol=0.08)
 
 
 @pytest.mark.parametrize("value", [1.0, 0.3, 7e-200])
 def test_equal_weights_draw_like_no_weights(value: float) -> None:
-    weights = checked_weights(np.full(23, value), 23)
+    weights = check_weights(np.full(23, value), 23)
     for epoch in range(3):
-        np.testing.assert_array_equal(drawn(5, epoch, 23, weights), drawn(5, epoch, 23))
+        np.testing.assert_array_equal(draw_views(5, epoch, 23, weights), draw_views(5, epoch, 23))
 
 
 @pytest.mark.parametrize(

@@ -16,9 +16,9 @@ from g2ard.stages.recover.anchors import (
     REGULARIZERS,
     Anchors,
     Regularizers,
+    choose_regularizers,
     drift95,
-    regularizers_for,
-    view_consistency,
+    measure_view_consistency,
 )
 from g2ard.stages.recover.config import PAPER, TUNED, Schedule
 from g2ard.stages.recover.losses import anchor_loss, regularization, shape_loss
@@ -136,21 +136,21 @@ def test_auto_preset_tells_lift_trained_and_noisy_apart() -> None:
         trained.means, scales=np.tile([1.0, 1e-3, 1e-3], (40, 1)), logit_opacities=trained.logit_opacities
     )
     round_ = Splats.create(trained.means, scales=np.ones((40, 3)), logit_opacities=trained.logit_opacities)
-    assert regularizers_for("auto", lift)[0] == REGULARIZERS["lift"]
-    assert regularizers_for("auto", noisy)[0] == REGULARIZERS["noisy"]
-    assert regularizers_for("auto", round_)[0] == REGULARIZERS["trained"]
-    weights, why, measured = regularizers_for("lift", noisy)
+    assert choose_regularizers("auto", lift)[0] == REGULARIZERS["lift"]
+    assert choose_regularizers("auto", noisy)[0] == REGULARIZERS["noisy"]
+    assert choose_regularizers("auto", round_)[0] == REGULARIZERS["trained"]
+    weights, why, measured = choose_regularizers("lift", noisy)
     assert weights == REGULARIZERS["lift"]
     assert why == "lift (as requested)"
     assert (
-        regularizers_for("auto", lift, paper=True)[0]
+        choose_regularizers("auto", lift, paper=True)[0]
         == PAPER_REGULARIZERS["lift"]
         == Regularizers(1e-3, 1e-4, True)
     )
     assert measured.needle == 1
     assert measured.consistency is None
     with pytest.raises(InputError, match="preset"):
-        regularizers_for("gentle", trained)
+        choose_regularizers("gentle", trained)
 
 
 def test_views_that_see_through_each_other_s_surfaces_make_a_prior_noisy() -> None:
@@ -160,16 +160,16 @@ def test_views_that_see_through_each_other_s_surfaces_make_a_prior_noisy() -> No
     rows = rng.permutation(len(ball))[:1200]
     strewn[rows] = rng.normal(0, 0.8, (1200, 3))
     foggy = replace(ball, means=strewn, logit_opacities=np.full(len(ball), 3, np.float32))
-    sound, loose = view_consistency(ball, views), view_consistency(foggy, views)
+    sound, loose = measure_view_consistency(ball, views), measure_view_consistency(foggy, views)
     assert loose < 0.92 < 0.97 < sound
-    assert regularizers_for("auto", ball, views)[0] == REGULARIZERS["trained"]
-    weights, why, _ = regularizers_for("auto", foggy, views)
+    assert choose_regularizers("auto", ball, views)[0] == REGULARIZERS["trained"]
+    weights, why, _ = choose_regularizers("auto", foggy, views)
     assert weights == REGULARIZERS["noisy"]
     assert "of the surface agrees between neighbouring views" in why
     far = np.array([447_000.0, 5_411_000.0, 130.0])
-    moved = view_consistency(replace(ball, offset=ball.offset + far), views.recentred(-far))
+    moved = measure_view_consistency(replace(ball, offset=ball.offset + far), views.recentred(-far))
     assert moved == pytest.approx(sound, abs=0.01)
-    assert view_consistency(ball, views.take([0])) is None
+    assert measure_view_consistency(ball, views.take([0])) is None
 
 
 @pytest.mark.parametrize(("ratio", "agree"), [(1, 1), (1.04, 1), (1.06, 0), (1.3, 0), (0.96, 1), (0.94, 0)])
@@ -186,7 +186,7 @@ def test_depths_agree_within_a_twentieth(ratio: float, agree: int, monkeypatch: 
             return SimpleNamespace(median=np.full((24, 32), next(depths)))
 
     monkeypatch.setattr("g2ard.stages.recover.anchors.Renderer", Renders)
-    assert view_consistency(checkered_ball(10), views) == agree
+    assert measure_view_consistency(checkered_ball(10), views) == agree
 
 
 def test_a_scaled_schedule_keeps_its_proportions() -> None:

@@ -16,7 +16,7 @@ from g2ard.scene.cameras import Cameras
 from g2ard.stages.recover.anchors import Anchors, Regularizers
 from g2ard.stages.recover.config import Rates
 from g2ard.stages.recover.engine import Photometric
-from g2ard.stages.recover.losses import extents, l1_ssim, regularization, share_of_rate
+from g2ard.stages.recover.losses import l1_ssim, measure_extents, regularization, share_of_rate
 from g2ard.stages.recover.rasterize import rasterize
 from g2ard.system import devices
 from helpers.gpus import skip_without_gpu
@@ -207,7 +207,7 @@ def test_sizes_on_the_screen_are_the_naive_ones() -> None:
     p["means"][::9] *= 20  # some far off the image, some behind the camera
     p["log_scales"][::5, 2] = -25
     tensors = [torch.from_numpy(p[k].astype(np.float64)) for k in ("means", "quats", "log_scales")]
-    largest, axes = extents(*tensors, cameras[0], 0, SETTINGS.near_of(0))
+    largest, axes = measure_extents(*tensors, cameras[0], 0, SETTINGS.near_of(0))
     want = naive_shares(p, cameras[0], 3.0)
     np.testing.assert_allclose(share_of_rate(largest, 3.0)[:, None], want["means"], rtol=1e-4, atol=1e-12)
     np.testing.assert_allclose(share_of_rate(axes, 3.0), want["log_scales"], rtol=1e-4, atol=1e-12)

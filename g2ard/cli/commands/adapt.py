@@ -7,7 +7,7 @@ import typer
 
 from g2ard.cli import options as opt
 from g2ard.cli.command import command
-from g2ard.cli.resume import check_scene_run, checkpoint_beside, stoppable
+from g2ard.cli.resume import check_scene_run, place_checkpoint, stoppable
 from g2ard.cli.run import Run
 from g2ard.cli.run_result import tell_plan
 from g2ard.config.schema import listed
@@ -53,7 +53,7 @@ def adapt(
     settings, _ = run.settled(AdaptConfig(), preset)
     opt.check_engine(settings.get("adapt.engine"))
     config = configured(AdaptConfig(), preset or "auto", settings)
-    work = checkpoint_beside(output, ".work")
+    work = place_checkpoint(output, ".work")
     if not dry_run:
         check_scene_run(run, work, resume, output)
     splats = run.load(compact)

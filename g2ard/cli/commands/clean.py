@@ -11,7 +11,7 @@ import typer
 from g2ard.cli.command import command
 from g2ard.cli.options import DryRunOption, SceneArgument, picture
 from g2ard.cli.run import Run
-from g2ard.cli.run_result import memory_of
+from g2ard.cli.run_result import describe_memory
 from g2ard.errors import InputError
 from g2ard.io import Source
 from g2ard.progress import plural
@@ -142,7 +142,7 @@ def _tell_plan(run: Run, count: int, cost: Cost) -> None:
     views = f", looked at in {cost.views} views" if cost.views else ""
     run.answer(
         f"{plural(count, 'Gaussian')}{views}: roughly {max(1, cost.seconds):.0f} s on two cores and "
-        f"{memory_of(cost)}"
+        f"{describe_memory(cost)}"
     )
     run.say_dry()
     if cost.views:
@@ -157,7 +157,7 @@ def _paint(path: Path, done: Cleaned, cameras: Cameras, overwrite: bool) -> None
     from g2ard.io.images import write_png
     from g2ard.jobs.clean import painted
     from g2ard.rendering.renderer import Renderer
-    from g2ard.report.sheet import contact_sheet
+    from g2ard.report.sheet import draw_contact_sheet
     from g2ard.scene.samples import evenly_spaced
 
     colors = np.array([*(color for _, color in _COLORS.values()), _GREY])[done.clutter.kind]
@@ -171,5 +171,5 @@ def _paint(path: Path, done: Cleaned, cameras: Cameras, overwrite: bool) -> None
         for name, count, word in found
     )
     labels = [f"before: {len(scenes[0]):,}", "removed, in colour", f"after: {len(scenes[2]):,}"]
-    sheet = contact_sheet(rows, labels, row_labels=[legend] * len(rows))
+    sheet = draw_contact_sheet(rows, labels, row_labels=[legend] * len(rows))
     write_png(path, sheet, overwrite=overwrite)

@@ -14,7 +14,7 @@ from g2ard.config.choices import BLACK, Colour, is_made
 from g2ard.io import Source
 from g2ard.io.paths import real_path
 from g2ard.progress import plural
-from g2ard.report.labels import labels_of, names_of
+from g2ard.report.labels import label_scenes, name_scenes
 
 if TYPE_CHECKING:
     from g2ard.scene.splats import Splats
@@ -112,7 +112,7 @@ def compare(
                 )
                 for what, name in shown.items()
             ]
-            labels = labels_of(sources, [len(dense), len(other)], roles)
+            labels = label_scenes(sources, [len(dense), len(other)], roles)
             scenes = [(label, stand.of(splats)) for label, splats in zip(labels, (dense, other), strict=True)]
             write_page(
                 output,
@@ -125,13 +125,15 @@ def compare(
             )
             run.kept.append(f"{output} is written")
             run.say(f"{output}: opens at {stand.name}; the arrows below lead to the worst views")
-    closer = _closer(run, first, second, dense, other, colour)
+    closer = _name_closer(run, first, second, dense, other, colour)
     if closer is not None:
         run.say(closer)
     run.result({**scores.as_dict(), "closer": closer, "output": None if output is None else str(output)})
 
 
-def _closer(run: Run, first: Path, second: Path, dense: Splats, other: Splats, colour: Colour) -> str | None:
+def _name_closer(
+    run: Run, first: Path, second: Path, dense: Splats, other: Splats, colour: Colour
+) -> str | None:
     """Say which of two results is closer to the scene that both show; None if one is that scene.
 
     Only runs know what they were made of.
@@ -158,6 +160,6 @@ def _closer(run: Run, first: Path, second: Path, dense: Splats, other: Splats, c
     scores = [
         evaluate(splats, targets, background=colour, progress=run.progress) for splats in (dense, other)
     ]
-    line = better_line(names_of([first, second]), scores, targets, "test")
+    line = better_line(name_scenes([first, second]), scores, targets, "test")
     targets_of = "the photos" if common.teacher is None else str(common.teacher)
     return f"against {targets_of}, {line}"

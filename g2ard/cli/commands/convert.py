@@ -125,12 +125,12 @@ def convert(
     from g2ard.jobs.chosen_points import PointChoice
     from g2ard.jobs.convert import Changes, opened_scenes, read_merged
 
-    scenes, output = _parted(run, scenes, output)
+    scenes, output = _part_paths(run, scenes, output)
     given = {"spz_version": spz_version, "compress": compress, "layout": layout}
     options: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
     if layout is not None and sh_degree not in (None, 3):
         raise typer.BadParameter("--layout inria has SH degree 3; leave --sh-degree out")
-    matrix = None if transform is None else _matrix(transform)
+    matrix = None if transform is None else _read_matrix(transform)
     opened = opened_scenes(scenes, run.render_model)
     points = None
     corners = None if box is None else numbers("--box", box, 6)
@@ -157,7 +157,7 @@ def convert(
     _check_output(run, output, options)
     if to_axes is not None and not as_table and (defined := scene_format(output)).axes is not None:
         changes = replace(changes, to_axes=None)  # the format's writer makes the change
-        options = _with_axes(options, defined, output, NAMED_AXES.get(to_axes) or cast("Axes", to_axes))
+        options = _add_axes(options, defined, output, NAMED_AXES.get(to_axes) or cast("Axes", to_axes))
     run.begin("read")
     whole = read_merged(opened, points, from_axes, **run.callbacks)
     splats = changes.apply(whole)
@@ -176,7 +176,7 @@ def convert(
     run.result({"output": str(output), "input_count": read, "output_count": len(splats), "bytes": size})
 
 
-def _parted(run: Run, paths: list[Path], output: Path | None) -> tuple[list[Path], Path]:
+def _part_paths(run: Run, paths: list[Path], output: Path | None) -> tuple[list[Path], Path]:
     """Return the scenes and the output, which is the last path unless -o is given."""
     if output is not None:
         return paths, output
@@ -198,7 +198,7 @@ def _check_output(run: Run, output: Path, options: dict[str, Any]) -> None:
     run.claim_file("--output", output)
 
 
-def _with_axes(
+def _add_axes(
     options: dict[str, Any], output_format: SceneFormat, output: Path, axes: Axes
 ) -> dict[str, Any]:
     """Return the writer's options, with other axes than those that its format defines."""
@@ -213,7 +213,7 @@ def _with_axes(
     return {**({} if axes == "RDF" else {"spz_version": 4}), **options, "axes": axes}
 
 
-def _matrix(given: str) -> list[list[float]]:
+def _read_matrix(given: str) -> list[list[float]]:
     """Read 16 numbers, or a JSON file with them, flat or in rows, bare or under "transform" or "matrix"."""
     path = Path(given)
     if path.suffix.lower() != ".json":

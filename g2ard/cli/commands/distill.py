@@ -9,10 +9,10 @@ import typer
 
 from g2ard.cli import options as opt
 from g2ard.cli.command import command
-from g2ard.cli.outputs import budget_of, refuse_file
+from g2ard.cli.outputs import read_budget, refuse_file
 from g2ard.cli.run import Run
-from g2ard.cli.run_result import say_fit, tell_plan, tell_run, told
-from g2ard.cli.work_folder import drop_work, tiling_of, work_folder
+from g2ard.cli.run_result import list_remarks, say_fit, tell_plan, tell_run
+from g2ard.cli.work_folder import drop_work, read_tiling, work_folder
 from g2ard.config.choices import is_made
 from g2ard.io import Source
 
@@ -103,7 +103,7 @@ def distill(
     from g2ard.report.distilled import Drawn
 
     settings, _ = run.settled(DistillConfig(), preset)
-    budget = budget_of(run, optional=scene is None)
+    budget = read_budget(run, optional=scene is None)
     given = views is not None and not is_made(views)
     _check_options(scene, views, held_out, photos)
     if given:
@@ -117,7 +117,7 @@ def distill(
     opt.choose_points(run, source)
     folder = RunFolder(run, output, f"scene.{format}", resume)
     if not dry_run and (finished := folder.check(budget)):
-        drop_work(tiling_of(run, source, output))
+        drop_work(read_tiling(run, source, output))
         run.result(finished)
         return
     if source is not None and source.kind == "views":
@@ -136,7 +136,7 @@ def distill(
         time=time,
         settings=settings,
     )
-    tiling = tiling_of(run, source, output)
+    tiling = read_tiling(run, source, output)
     how = tiling if source is not None and is_tiled(source, tiling) else None
     if scene is not None and budget is not None and how is None:
         say_fit(run, scene, budget, f"scene.{format}")
@@ -160,7 +160,9 @@ def distill(
             with run.finishing("scoring"):
                 report: Any = job.report(done, folder.scene, drawn)
             if drawn is not None:
-                report, line = folder.write_pages(source or name, job, done, report, told(report), drawn)
+                report, line = folder.write_pages(
+                    source or name, job, done, report, list_remarks(report), drawn
+                )
             folder.write_report(report)
     tell_run(run, name, job, done, report, folder, line)
 

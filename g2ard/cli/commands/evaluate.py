@@ -15,7 +15,7 @@ from g2ard.cli.run import Run
 from g2ard.config.choices import BLACK, LpipsInput
 from g2ard.errors import InputError
 from g2ard.io import Source
-from g2ard.report.labels import names_of
+from g2ard.report.labels import name_scenes
 
 if TYPE_CHECKING:
     from g2ard.jobs.inputs import Views
@@ -163,7 +163,7 @@ def evaluate(
         judged.append(at_own_size or scored)
         if output is not None:
             loaded.append(splats)
-        drift = None if frozen is None else _drift(frozen, splats, path)
+        drift = None if frozen is None else _measure_drift(frozen, splats, path)
         rows.append(
             {
                 "scene": str(path),
@@ -177,10 +177,10 @@ def evaluate(
         )
     protocol = f"{convention}'s conventions, {'8-bit' if eight_bit else 'float'} renders"
     name = "" if split == "all" else split
-    _table(run, f"{scored_in(targets, name)}; {protocol}", rows)
-    names = names_of(scenes)
+    _print_table(run, f"{scored_in(targets, name)}; {protocol}", rows)
+    names = name_scenes(scenes)
     if unshrunk is not None:
-        run.say(_own_size_line(names, rows))
+        run.say(_describe_own_size(names, rows))
     better = better_line(names, found, targets, name)
     if better:
         run.say(better)
@@ -214,7 +214,7 @@ def _write_ladder(
     from g2ard.jobs.viewer_frame import best_level
     from g2ard.poses import best_views
     from g2ard.rendering.targets import Subset, TeacherRenders
-    from g2ard.report.ladder import Dense, Rung, labels, ladder, recommendation
+    from g2ard.report.ladder import Dense, Rung, label_sizes, recommend_size, write_ladder
 
     run.begin("page")
     dense = teaching.dense
@@ -223,8 +223,8 @@ def _write_ladder(
     if dense is not None and teaching.teacher is not None:
         teacher = Path(str(teaching.teacher))
         top = Dense(teacher.name, len(dense), bytes_of(teacher))
-    names = names_of([path for path, _, _ in results])
-    words = labels(names, [len(splats) for _, splats, _ in results], None if top is None else top.count)
+    names = name_scenes([path for path, _, _ in results])
+    words = label_sizes(names, [len(splats) for _, splats, _ in results], None if top is None else top.count)
     rungs = sorted(
         (
             Rung(name, word, bytes_of(path), splats, scores)
@@ -239,7 +239,7 @@ def _write_ladder(
         name = best_views(rungs[-1].splats if dense is None else dense, 1, cameras).names[0]
         shown = Subset(targets, [cameras.names.index(name)])
     title = f"{'photos' if top is None else top.name}: {len(rungs)} sizes"
-    ladder(
+    write_ladder(
         output,
         title,
         rungs,
@@ -251,12 +251,12 @@ def _write_ladder(
         overwrite=run.overwrite,
     )
     run.kept.append(f"{output} is written")
-    advice = recommendation(rungs)
+    advice = recommend_size(rungs)
     run.say(f"{output}: {advice}")
     return advice
 
 
-def _drift(frozen: Splats, splats: Splats, path: Path) -> float:
+def _measure_drift(frozen: Splats, splats: Splats, path: Path) -> float:
     """Return the Drift95 of a scene from the same Gaussians before recovery."""
     from g2ard.stages.recover.anchors import Anchors, drift95
 
@@ -268,11 +268,11 @@ def _drift(frozen: Splats, splats: Splats, path: Path) -> float:
     return drift95(Anchors.of(frozen.narrowed(splats.offset)), splats.means)
 
 
-def _own_size_line(names: list[str], rows: list[dict[str, Any]]) -> str:
+def _describe_own_size(names: list[str], rows: list[dict[str, Any]]) -> str:
     """Describe the scores at the views' own size.
 
     >>> score = {"psnr": 25.5, "ssim": 0.8, "scored_in": "7 photos, 960×540 px"}
-    >>> _own_size_line(["a"], [{"own_size": score}])
+    >>> _describe_own_size(["a"], [{"own_size": score}])
     "at the views' own size (7 photos, 960×540 px): 25.50 dB, SSIM 0.8000"
     """
     scores = [row["own_size"] for row in rows]
@@ -282,9 +282,9 @@ def _own_size_line(names: list[str], rows: list[dict[str, Any]]) -> str:
     return f"at the views' own size ({scores[0]['scored_in']}): {'; '.join(told)}"
 
 
-def _table(run: Run, title: str, rows: list[dict[str, Any]]) -> None:
+def _print_table(run: Run, title: str, rows: list[dict[str, Any]]) -> None:
     columns = {
-        "scene": names_of([Path(r["scene"]) for r in rows]),
+        "scene": name_scenes([Path(r["scene"]) for r in rows]),
         "Gaussians": [f"{r['count']:,}" for r in rows],
         "MB": [f"{r['file_bytes'] / 1e6:.2f}" for r in rows],
         "PSNR": [f"{r['psnr']:.2f}" for r in rows],

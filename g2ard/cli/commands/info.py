@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from g2ard.cli import options as opt
-from g2ard.cli.command import command, one_line
+from g2ard.cli.command import command, describe_error
 from g2ard.cli.run import Run
 from g2ard.errors import InputError
 from g2ard.io.detect import run_scene
@@ -46,7 +46,7 @@ def info(
     if bool(paths) == devices:
         raise typer.BadParameter("give a file, or --devices")
     if not paths:
-        _devices(run)
+        _list_devices(run)
         return
     from g2ard.io.types import ViewFiles
 
@@ -55,13 +55,13 @@ def info(
     for path in paths:
         run.begin("read")
         try:
-            figures, rows = _described(ViewFiles(path, images))
+            figures, rows = _describe(ViewFiles(path, images))
             if images is not None and figures.get("kind") != "views":
                 raise InputError("holds no views", path=path, hint="leave {images} out")
         except (InputError, OSError) as error:
             if len(paths) == 1:
                 raise
-            run.console.error(one_line(error, run.flags))
+            run.console.error(describe_error(error, run.flags))
             failed.append(str(path))
             continue
         _show(run, str(path), rows)
@@ -71,28 +71,28 @@ def info(
         raise typer.Exit(1)
 
 
-def _described(given: ViewFiles) -> tuple[dict[str, Any], list[list[str]]]:
+def _describe(given: ViewFiles) -> tuple[dict[str, Any], list[list[str]]]:
     """Return a file's figures, with scores for a run, and the table rows that show them."""
-    from g2ard.cli.run_folder import stopped_run
+    from g2ard.cli.run_folder import describe_stopped_run
     from g2ard.io.describe import describe
     from g2ard.io.jsonfile import read_json
     from g2ard.report.labels import RESULT
 
     path = given.path
-    if (stopped := stopped_run(path)) is not None:
-        return stopped, _rows_of_stopped(path, stopped)
+    if (stopped := describe_stopped_run(path)) is not None:
+        return stopped, _list_stopped(path, stopped)
     scene = run_scene(path)
     if scene == path:
-        figures = describe(given, _overdraw)
+        figures = describe(given, _measure_overdraw)
         if figures["kind"] == "views":
             from g2ard.jobs.start_points import sparse_file, sparse_points
 
-            points = sparse_points(sparse_file(path), partial(_noted, figures))
+            points = sparse_points(sparse_file(path), partial(_add_note, figures))
             figures["sparse_points"] = 0 if points is None else len(points)
-        return figures, _rows(figures)
-    figures = describe(scene, _overdraw)
+        return figures, _list_figures(figures)
+    figures = describe(scene, _measure_overdraw)
     report = read_json(path / "report.json")
-    against, scores = _scores(report)
+    against, scores = _read_scores(report)
     figures["run"] = {"input_count": report["input_count"], "against": against, "scores": scores}
     photos = report.get("photos")
     one = "point" if report.get("lifted") else "Gaussian"
@@ -104,28 +104,28 @@ def _described(given: ViewFiles) -> tuple[dict[str, Any], list[list[str]]]:
         ssim = f", SSIM {found['ssim']:.4f}" if "ssim" in found else ""
         size = f", {report['size']}" if "size" in report else ""
         rows.append([words[name], f"{found['psnr']:.2f} dB{ssim} against {against}{size}"])
-    return figures, [*_rows(figures), *rows]
+    return figures, [*_list_figures(figures), *rows]
 
 
-def _noted(figures: dict[str, Any], text: str) -> None:
+def _add_note(figures: dict[str, Any], text: str) -> None:
     figures["notes"].append({"code": "no_points", "count": 1, "text": text.removeprefix("warning: ")})
 
 
-def _overdraw(splats: Splats) -> dict[str, Any]:
+def _measure_overdraw(splats: Splats) -> dict[str, Any]:
     from g2ard.jobs.close_up import close_up
 
     found = close_up(splats)
     return {} if found is None else {"close_overdraw": found}
 
 
-def _scores(report: dict[str, Any]) -> tuple[str, dict[str, dict[str, float]]]:
+def _read_scores(report: dict[str, Any]) -> tuple[str, dict[str, dict[str, float]]]:
     """Return the name of a run's targets and its scores."""
     return report["against"], {
         name: {k: found[k] for k in ("psnr", "ssim")} for name, found in report["scores"].items()
     }
 
 
-def _rows_of_stopped(path: Path, stopped: dict[str, Any]) -> list[list[str]]:
+def _list_stopped(path: Path, stopped: dict[str, Any]) -> list[list[str]]:
     rows = [["stopped run", ", ".join(stopped["kept"]) + " kept"]]
     if "config" in stopped:
         rows.append(["Gaussians", f"{stopped['input_count']:,} → {stopped['output_count']:,}"])
@@ -135,7 +135,7 @@ def _rows_of_stopped(path: Path, stopped: dict[str, Any]) -> list[list[str]]:
     return rows
 
 
-def _devices(run: Run) -> None:
+def _list_devices(run: Run) -> None:
     from g2ard.system import devices
 
     found = devices.adapters()
@@ -145,7 +145,7 @@ def _devices(run: Run) -> None:
     for a in found or ():
         rows += [
             [a.name, f"{a.kind}, {a.backend}, {a.driver}"],
-            ["", f"buffers to {_size(a.max_buffer)}, bound {_size(a.max_binding)} at a time"],
+            ["", f"buffers to {_format_size(a.max_buffer)}, bound {_format_size(a.max_binding)} at a time"],
         ]
     if not found:
         why = "this build has no GPU kernels" if found is None else _NO_DRIVER
@@ -162,37 +162,41 @@ def _show(run: Run, title: str, rows: list[list[str]]) -> None:
     run.console.table(title, ["", ""], rows, stdout=run.json != "-")
 
 
-def _rows(figures: dict[str, Any]) -> list[list[str]]:
+def _list_figures(figures: dict[str, Any]) -> list[list[str]]:
     """Return the (label, text) rows of a table of what `describe` found; keys depend on the kind of file."""
     unit = {"splats": "Gaussians", "points": "points", "views": "views"}[figures["kind"]]
-    rows = [["format", figures["format"]], [unit, f"{figures['count']:,}"], ["size", _size(figures["bytes"])]]
+    rows = [
+        ["format", figures["format"]],
+        [unit, f"{figures['count']:,}"],
+        ["size", _format_size(figures["bytes"])],
+    ]
     if figures["kind"] == "splats":
         rows.append(["bytes per Gaussian", f"{figures['bytes'] / figures['count']:.1f}"])
         rows.append(["SH degree", str(figures["sh_degree"])])
         rows.append(["render model", figures["render_model"]])
     if any(figures.get("offset", ())):
-        rows.append(["offset", _vector(figures["offset"], 3)])
+        rows.append(["offset", _format_vector(figures["offset"], 3)])
     if "map_system" in figures:
         rows.append(["map system", figures["map_system"]])
     if "metres_per_unit" in figures:
-        rows.append(["unit", _unit(figures["metres_per_unit"])])
+        rows.append(["unit", _name_unit(figures["metres_per_unit"])])
     extent = figures["extent"]
     longest = max(high - low for low, high in zip(extent["min"], extent["max"], strict=True))
     digits = max(0, 3 - math.floor(math.log10(longest or 1)))
     low, high, near, far = (
-        _vector(extent[name], digits) for name in ("min", "max", "robust_min", "robust_max")
+        _format_vector(extent[name], digits) for name in ("min", "max", "robust_min", "robust_max")
     )
     rows += [["extent", f"{low} to {high}"], ["98 % of it", f"{near} to {far}"]]
     for key in ("opacity", "largest_scale", "smallest_scale", "elongation"):
         if key in figures:
-            rows.append([key.replace("_", " "), _spread(figures[key])])
+            rows.append([key.replace("_", " "), _describe_spread(figures[key])])
     if "fov_degrees" in figures:
-        rows.append(["field of view", _spread(figures["fov_degrees"], "°")])
+        rows.append(["field of view", _describe_spread(figures["fov_degrees"], "°")])
     if "close_overdraw" in figures:
         close = figures["close_overdraw"]
         rows.append(["Gaussians per pixel, near", f"{close['mean']:.0f}, at worst {close['worst']:.0f}"])
     if "color" in figures:
-        rows.append(["mean colour", _vector(figures["color"]["mean"], 2)])
+        rows.append(["mean colour", _format_vector(figures["color"]["mean"], 2)])
     rows += [[key, f"{figures[key]:,}"] for key in ("photos", "distorted") if key in figures]
     if "sparse_points" in figures:
         rows.append(["sparse points", f"{figures['sparse_points']:,}"])
@@ -201,12 +205,12 @@ def _rows(figures: dict[str, Any]) -> list[list[str]]:
     return rows + [["note", note["text"]] for note in figures["notes"]]
 
 
-def _spread(quantiles: dict[str, float], unit: str = "") -> str:
+def _describe_spread(quantiles: dict[str, float], unit: str = "") -> str:
     """Describe a distribution by its quantiles.
 
-    >>> _spread({"0": 0.001, "1": 0.01, "25": 0.1, "50": 0.25, "75": 0.5, "99": 0.9, "100": 1.0})
+    >>> _describe_spread({"0": 0.001, "1": 0.01, "25": 0.1, "50": 0.25, "75": 0.5, "99": 0.9, "100": 1.0})
     'median 0.25, half from 0.1 to 0.5, all from 0.001 to 1'
-    >>> _spread(dict.fromkeys(("0", "1", "25", "50", "75", "99", "100"), 42.87), "°")
+    >>> _describe_spread(dict.fromkeys(("0", "1", "25", "50", "75", "99", "100"), 42.87), "°")
     '42.9°'
     """
     least, lower, median, upper, most = (
@@ -217,10 +221,10 @@ def _spread(quantiles: dict[str, float], unit: str = "") -> str:
     return f"median {median}, half from {lower} to {upper}, all from {least} to {most}"
 
 
-def _unit(metres: float | None) -> str:
+def _name_unit(metres: float | None) -> str:
     """Name a unit of length.
 
-    >>> _unit(1200 / 3937), _unit(None)
+    >>> _name_unit(1200 / 3937), _name_unit(None)
     ('US survey foot', 'not stated in the file')
     """
     if metres is None:
@@ -229,9 +233,9 @@ def _unit(metres: float | None) -> str:
     return named.get(round(metres, 7), f"{metres:g} m")
 
 
-def _vector(values: list[float], digits: int) -> str:
+def _format_vector(values: list[float], digits: int) -> str:
     return "(" + ", ".join(f"{value:,.{digits}f}" for value in values) + ")"
 
 
-def _size(count: int) -> str:
+def _format_size(count: int) -> str:
     return f"{count / 1e6:,.1f} MB" if count >= 1e5 else f"{count:,} bytes"

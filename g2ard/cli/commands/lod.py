@@ -15,7 +15,7 @@ from g2ard.cli.budget_options import Ratios
 from g2ard.cli.command import command
 from g2ard.cli.outputs import refuse_file
 from g2ard.cli.run import Run
-from g2ard.cli.work_folder import tiling_of, work_folder
+from g2ard.cli.work_folder import read_tiling, work_folder
 from g2ard.config.choices import BLACK, UNITS, LengthUnit
 from g2ard.io.atomic import hidden_name
 from g2ard.progress import plural
@@ -130,8 +130,8 @@ def lod(
         check_stopped,
         drop_ended,
         is_finished,
-        record_of,
-        recorded,
+        read_record,
+        record_finish,
         stoppable,
     )
     from g2ard.io import Source
@@ -158,8 +158,8 @@ def lod(
     with run.usage():
         check_ratios(ratios)
         rule = Cut(most * 1024, extent, least * 1024)
-        spot = None if place is None else _georeference(place)
-    tiling = tiling_of(run, source, output)
+        spot = None if place is None else _parse_georeference(place)
+    tiling = read_tiling(run, source, output)
     tiled = is_tiled(source, tiling)
     if spot is not None and kind == "sog":
         raise typer.BadParameter("--georeference needs --format 3dtiles")
@@ -181,7 +181,7 @@ def lod(
     if not (dry_run or (tiled and tiling.keep)):
         finished |= drop_ended(run, work, resume or tiled, meta)
     if not (finished or dry_run):
-        ended = record_of(meta) is not None
+        ended = read_record(meta) is not None
         run.overwrite |= (tiled or resume) and not ended and began_output(work, output)
         check_output(output, run.overwrite, folder=True)
     if finished or not (tiled or dry_run):
@@ -199,7 +199,7 @@ def lod(
         held = work_folder(run, None if dry_run else how, views)
     else:
         held = stoppable(run, stopped, resume, meta)
-    noted = recorded(run, meta) if tiled and not dry_run else nullcontext()
+    noted = record_finish(run, meta) if tiled and not dry_run else nullcontext()
     options: dict[str, Any] = {"ratios": ratios, "recover": recover, "steps": steps, "background": colour}
     options |= {"split_sky": environment, "seed": run.seed, **run.callbacks}
     options |= {"views": views, "size": size, "up": up, "beside": scene}
@@ -260,7 +260,7 @@ def _tell_costs(run: Run, job: LevelsJob) -> None:
     run.result({"levels": levels, "total": {"seconds": seconds, "bytes": most}})
 
 
-def _georeference(text: str) -> Georeference | str:
+def _parse_georeference(text: str) -> Georeference | str:
     """Return the place, or the name of the map system in which the scene's offset is the place."""
     from g2ard.levels import Georeference
     from g2ard.levels.tileset import map_system

@@ -7,9 +7,9 @@ import typer
 
 from g2ard.cli import options as opt
 from g2ard.cli.command import command
-from g2ard.cli.resume import check_scene_run, checkpoint_beside, stoppable
+from g2ard.cli.resume import check_scene_run, place_checkpoint, stoppable
 from g2ard.cli.run import Run
-from g2ard.cli.run_result import loss, tell_plan
+from g2ard.cli.run_result import describe_loss, tell_plan
 from g2ard.config.schema import listed
 from g2ard.io.scene_formats import check_positions
 from g2ard.progress import plural
@@ -52,9 +52,9 @@ def recover(
     from g2ard.jobs.recover import prepare
     from g2ard.jobs.teaching import check_teacher
     from g2ard.rendering.targets import kinds_of
-    from g2ard.report.run import COLUMNS, cells
+    from g2ard.report.run import COLUMNS, list_cells
     from g2ard.stages.recover.config import RecoverConfig
-    from g2ard.stages.recover.report import cut_short, outcome, unregularized
+    from g2ard.stages.recover.report import describe_idle_regularizers, describe_outcome, describe_time_limit
 
     if teacher is not None and not photos:
         run.refuse_typed("with --teacher, unless --photos is given", "alpha")
@@ -62,7 +62,7 @@ def recover(
     settings, _ = run.settled(RecoverConfig(), preset)
     with run.usage():
         check_teacher(views, teacher)
-    checkpoint = checkpoint_beside(output, ".checkpoint.npz")
+    checkpoint = place_checkpoint(output, ".checkpoint.npz")
     if not dry_run:
         check_scene_run(run, checkpoint, resume, output)
     opt.check_engine(settings.get("recover.engine"))
@@ -92,8 +92,8 @@ def recover(
         result = job.run(checkpoint)
         run.write(output, result.splats)
     exposure = str(result.report.exposure or "")
-    lines = [outcome(result.report), cut_short(result.report), exposure]
-    lines += [unregularized([[result.report]]) if run.verbose else None]
+    lines = [describe_outcome(result.report), describe_time_limit(result.report), exposure]
+    lines += [describe_idle_regularizers([[result.report]]) if run.verbose else None]
     for line in filter(None, lines):
         run.say(line)
     with run.finishing("scoring"):
@@ -101,8 +101,8 @@ def recover(
         if job.held_out is not None:
             pixels = job.held_out.cameras.size_text
             title = f"held-out views against {kinds_of(job.held_out)}, {pixels}, start → result:"
-            run.console.table(title, list(COLUMNS), cells(kinds))
-        for line in filter(None, (loss(kind, "the student is better there") for kind in kinds)):
+            run.console.table(title, list(COLUMNS), list_cells(kinds))
+        for line in filter(None, (describe_loss(kind, "the student is better there") for kind in kinds)):
             run.say(line)
     gain = result.report.psnr
     count = plural(len(job.student), "Gaussian")

@@ -113,7 +113,7 @@ def register(
     Each photo is registered, uncertain or refused; OUT gets the registered ones as views.
     """
     from g2ard.jobs.register import configured, prepare
-    from g2ard.report.registered import registration_report
+    from g2ard.report.registered import write_registration_report
     from g2ard.stages.register import RegisterConfig
     from g2ard.stages.register.report import summarize
 
@@ -152,17 +152,17 @@ def register(
     found = job.run()
     rows = found.report.photos
     summary = summarize(rows, keep=keep, true=len(job.truth), metres_per_unit=metres_per_unit)
-    lines = _told(summary)
+    lines = _summarize(summary)
     for line in lines:
         run.say(line)
     if len(found.cameras):
         run.write_views(output, found.cameras, format)
     if report is not None:
-        from g2ard.report.labels import names_of
+        from g2ard.report.labels import name_scenes
 
-        title = f"Photos in {names_of([scene])[0]}"
+        title = f"Photos in {name_scenes([scene])[0]}"
         with run.showing("--report"):
-            registration_report(
+            write_registration_report(
                 report,
                 title,
                 job.scene,
@@ -187,16 +187,20 @@ def register(
     run.say(f"{output}: {len(found.cameras)} of {plural(len(rows), 'photo')}")
 
 
-def _told(summary: Summary) -> list[str]:
+def _summarize(summary: Summary) -> list[str]:
     counts = f"{summary.registered} registered, {summary.uncertain} uncertain, {summary.refused} refused"
     scored = (("started from", summary.start), ("found", summary.found))
     return [
         f"{plural(summary.photos, 'photo')}: {counts}",
-        *(f"{words}: {_said(accuracy, summary)}" for words, accuracy in scored if accuracy is not None),
+        *(
+            f"{words}: {_describe_accuracy(accuracy, summary)}"
+            for words, accuracy in scored
+            if accuracy is not None
+        ),
     ]
 
 
-def _said(accuracy: Accuracy, summary: Summary) -> str:
+def _describe_accuracy(accuracy: Accuracy, summary: Summary) -> str:
     if accuracy.median is None:
         return f"0 of {summary.true} poses to score"
     scale = 1.0

@@ -98,7 +98,7 @@ def render(
         raise typer.BadParameter("give -o DIR, --sheet FILE.png or both")
     if turn is not None and (views is not None or looks is not None):
         raise typer.BadParameter("--orbit generates its views, so it excludes --views and -k")
-    output, file = _folder_or_file(run, output, depth)
+    output, file = _check_output(run, output, depth)
     single = file is not None and file.suffix.lower() == ".png"
     if single and views is None and turn is None:
         looks = looks or 1
@@ -139,7 +139,7 @@ def render(
     check_single(len(cameras))
     places = output_names(cameras.source or str(views), cameras.names) if output is not None else []
     if output is not None:
-        run.claim("--output", *(file for place in places for file in _files(output / place, depth)))
+        run.claim("--output", *(file for place in places for file in _name_files(output / place, depth)))
     shown: list[NDArray[np.uint8]] = []
     colour = opt.background_of(run, background, scene) or BLACK
     generated = turn is not None or looks is not None or is_planned(found)
@@ -184,7 +184,7 @@ def render(
     run.result({"images": len(cameras), "output": written[0]})
 
 
-def _folder_or_file(run: Run, output: Path | None, depth: bool) -> tuple[Path | None, Path | None]:
+def _check_output(run: Run, output: Path | None, depth: bool) -> tuple[Path | None, Path | None]:
     """Check the output, and return it as a folder or as the file of a picture or an animation."""
     from g2ard.io.animations import ANIMATIONS, check_animation
 
@@ -204,7 +204,7 @@ def _folder_or_file(run: Run, output: Path | None, depth: bool) -> tuple[Path | 
     return None, output
 
 
-def _files(stem: Path, depth: bool) -> list[Path]:
+def _name_files(stem: Path, depth: bool) -> list[Path]:
     """Return the files of one view: STEM.png and, with `depth`, STEM.depth.npy."""
     return [stem.with_name(stem.name + suffix) for suffix in (".png", ".depth.npy")[: 1 + depth]]
 
@@ -215,7 +215,7 @@ def _write_view(stem: Path, image: NDArray[np.float32], depth: NDArray[np.float3
 
     from g2ard.io.images import write_png
 
-    picture, *depths = _files(stem, depth is not None)
+    picture, *depths = _name_files(stem, depth is not None)
     picture.parent.mkdir(parents=True, exist_ok=True)
     write_png(picture, image)
     if depth is not None:
@@ -227,9 +227,9 @@ def _write_sheet(
 ) -> None:
     """Write a roughly square grid of all images, captioned by row."""
     from g2ard.io.images import write_png
-    from g2ard.report.sheet import contact_sheet
+    from g2ard.report.sheet import draw_contact_sheet
 
     columns = math.ceil(math.sqrt(len(images)))
     rows = [images[i : i + columns] for i in range(0, len(images), columns)]
     captions = [", ".join(names[i : i + columns]) for i in range(0, len(images), columns)]
-    write_png(path, contact_sheet(rows, [""] * columns, row_labels=captions), overwrite=overwrite)
+    write_png(path, draw_contact_sheet(rows, [""] * columns, row_labels=captions), overwrite=overwrite)

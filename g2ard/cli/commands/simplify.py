@@ -11,17 +11,17 @@ import typer
 
 from g2ard.cli import options as opt
 from g2ard.cli.command import command
-from g2ard.cli.outputs import Outputs, budgets_of
+from g2ard.cli.outputs import Outputs, read_budgets
 from g2ard.cli.run import Run
-from g2ard.cli.run_result import memory_of, say_fit, say_weight, tell_quality, tiles_of
-from g2ard.cli.work_folder import tiling_of, work_folder
+from g2ard.cli.run_result import count_tiles, describe_memory, say_fit, say_weight, tell_quality
+from g2ard.cli.work_folder import read_tiling, work_folder
 from g2ard.config.choices import is_made
 from g2ard.config.schema import listed
 from g2ard.io import Source
 from g2ard.io.atomic import atomic_output
 from g2ard.io.scene_formats import written_bytes
 from g2ard.progress import plural
-from g2ard.report.labels import counted
+from g2ard.report.labels import count_content
 from g2ard.system.peak_memory import peak_rss_of_all
 
 if TYPE_CHECKING:
@@ -76,7 +76,7 @@ def simplify(
     from g2ard.stages.simplify import SimplifyConfig
 
     config = run.settled(SimplifyConfig(), preset)[1]
-    budgets = budgets_of(run)
+    budgets = read_budgets(run)
     if views is not None and no_views:
         raise typer.BadParameter("--views and --no-views exclude each other; give one")
     if run.config["keep_region"] and no_views:
@@ -88,7 +88,7 @@ def simplify(
         run.refuse_typed("without generated views", "up")
     source = Source(scene, run.render_model, others or ())
     opt.choose_points(run, source)
-    tiling = tiling_of(run, source, output)
+    tiling = read_tiling(run, source, output)
     given = opt.with_images(views, images)
     name = "scene.ply" if output == opt.UNWRITTEN else output.name
     outputs = None if dry_run else Outputs(output, budgets, run.claim_scene)
@@ -172,7 +172,7 @@ def simplify(
             )
             for warning in warnings:
                 run.say(warning)
-            _tell(run, source, reduce, small, place, seconds["total"])
+            _tell_result(run, source, reduce, small, place, seconds["total"])
             if one.bytes is not None:
                 run.say(f"{place}: {written_bytes(place):,} of {one.bytes:,} bytes")
     run.results(reports)
@@ -188,30 +188,30 @@ def _tell_plan(run: Run, reduce: Reduction, counts: Sequence[int]) -> None:
         cost = cost_of_reduction(reduce, count)
         run.answer(
             f"{plural(count, 'Gaussian')}, weighed in {plural(cost.views, 'view')}: roughly "
-            f"{max(1, cost.seconds):.0f} s on two cores and {memory_of(cost)}"
+            f"{max(1, cost.seconds):.0f} s on two cores and {describe_memory(cost)}"
         )
         told: dict[str, Any] = {"count": count, "views": cost.views, "stages": cost.stages}
-        plans.append({**told, "bytes": cost.bytes, "seconds": cost.seconds, **tiles_of(reduce.plan)})
+        plans.append({**told, "bytes": cost.bytes, "seconds": cost.seconds, **count_tiles(reduce.plan)})
     run.say_dry()
     run.results(plans)
 
 
-def _tell(
+def _tell_result(
     run: Run, source: Source, reduce: Reduction, small: Simplified, output: Path, seconds: float
 ) -> None:
     from g2ard.stages.simplify.gaps import say_gaps
 
     if run.verbose and small.report.rounds:
-        _table(run, small)
+        _print_rounds(run, small)
     share = (small.report.unseen or 0) / reduce.total
     if share >= 0.02:
         run.say(f"note: no view sees {share:.0%} of the Gaussians; they are weighted by size only")
     say_gaps(small.report.opacity_lost, run.say)
     say_weight(run, source.path, output, reduce.splats)  # a sample has as much SH
-    run.say(f"{output}: {len(small.splats):,} of {counted(reduce.total, source)} in {seconds:.1f} s")
+    run.say(f"{output}: {len(small.splats):,} of {count_content(reduce.total, source)} in {seconds:.1f} s")
 
 
-def _table(run: Run, small: Simplified) -> None:
+def _print_rounds(run: Run, small: Simplified) -> None:
     columns = ["round", "before", "dropped", "merged", "refused", "trimmed", "after"]
     rows = []
     for number, r in enumerate(small.report.rounds, start=1):

@@ -13,7 +13,7 @@ from g2ard.cli import options as opt
 from g2ard.cli.command import command
 from g2ard.cli.run import Run
 from g2ard.io import Source
-from g2ard.report.labels import labels_of
+from g2ard.report.labels import label_scenes
 
 _LARGEST_DENSE = 2_000_000
 """Largest dense scene that is shown beside a run's result."""
@@ -66,7 +66,7 @@ def view(
         return
     with TemporaryDirectory(prefix="g2ard-") as folder:
         page = Path(folder) / "view.html"
-        _write(run, scene, other or _dense_of(scene), page, views, images, start, background, up)
+        _write(run, scene, other or _find_dense(scene), page, views, images, start, background, up)
         _show(run, page.parent, page.name)
 
 
@@ -76,7 +76,7 @@ def _is_levels(path: Path) -> bool:
     return (path / "index.html").is_file() and any((path / name).is_file() for name in levels)
 
 
-def _dense_of(path: Path) -> Path | None:
+def _find_dense(path: Path) -> Path | None:
     """Return the scene that a run was made of, if it is there and browsers can show it."""
     from g2ard.jobs.comparison import source_of
 
@@ -112,7 +112,7 @@ def _write(
     if views is None and scene.is_dir() and (own := scene / "views.json").is_file():
         views = own if any(read_views(own).image_paths) else "made"  # generated ones show what trains
     stand = frame_of(loaded[0], GivenViews(views, sources[0].file, up), start=start, say=run.say)
-    labels = labels_of(sources, [len(splats) for splats in loaded], roles)
+    labels = label_scenes(sources, [len(splats) for splats in loaded], roles)
     known = opt.background_of(run, background, scene, other)
     opened = sources[shown.index(scene)]
     run.begin("page")

@@ -174,7 +174,7 @@ class PriorMeasures(Report):
         thickness: median of smallest scale over middle scale.
         thickness_spread: upper over lower quartile of the thickness; a lift's discs are all alike.
         view_dependent: whether any colour depends on the view.
-        consistency: see `view_consistency`; None without two views to compare.
+        consistency: see `measure_view_consistency`; None without two views to compare.
     """
 
     needle: float
@@ -211,11 +211,11 @@ def measure_prior(prior: Splats, cameras: Cameras | None = None) -> PriorMeasure
         thickness=float(middle),
         thickness_spread=float(high / max(low, tiny)),
         view_dependent=bool(prior.shN.any()),
-        consistency=view_consistency(prior, cameras) if cameras is not None else None,
+        consistency=measure_view_consistency(prior, cameras) if cameras is not None else None,
     )
 
 
-def view_consistency(scene: Splats, cameras: Cameras) -> float | None:
+def measure_view_consistency(scene: Splats, cameras: Cameras) -> float | None:
     """Return the share of surface points of a view that its nearest neighbour does not see through.
 
     The median depth of a few small views is projected into the nearest other view. Points within 5 % of that
@@ -234,14 +234,14 @@ def view_consistency(scene: Splats, cameras: Cameras) -> float | None:
         depth, other = (renderer.render(small[view], median=True).median for view in (a, b))
         assert depth is not None
         assert other is not None
-        expected, seen = _carried(depth, other, small, a, b)
+        expected, seen = _carry_depths(depth, other, small, a, b)
         ratio = np.where(seen > 0, seen, np.inf) / expected
         agreeing += int((np.abs(ratio - 1) <= _SAME_DEPTH).sum())
         floating += int((ratio > 1 + _SAME_DEPTH).sum())
     return agreeing / (agreeing + floating) if agreeing + floating else None
 
 
-def _carried(
+def _carry_depths(
     depth: np.ndarray, other: np.ndarray, cameras: Cameras, a: int, b: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Project points of view `a` into view `b`; return their depth there, and the depth that `b` sees."""
@@ -257,7 +257,7 @@ def _carried(
     return points[2, inside], other[v[inside].astype(int), u[inside].astype(int)]
 
 
-def regularizers_for(
+def choose_regularizers(
     given: Regularizers | str | None, prior: Splats, cameras: Cameras | None = None, *, paper: bool = False
 ) -> tuple[Regularizers, str, PriorMeasures]:
     """Return the value of the setting `recover.regularizers`: as given, by name, or by measuring the prior.
@@ -284,12 +284,12 @@ def regularizers_for(
         raise InputError(f"expected auto, paper, {', '.join(REGULARIZERS)}, got {name!r}", parameter="preset")
     paper = paper or name.startswith("paper")
     measures = measure_prior(prior, cameras)
-    kind, why = (kind, "as requested") if kind != "auto" else _judged(measures)
+    kind, why = (kind, "as requested") if kind != "auto" else _judge(measures)
     said = f"the paper's for {kind}" if paper else kind
     return Regularizers.of(kind, paper=paper), f"{said} ({why})", measures
 
 
-def _judged(m: PriorMeasures) -> tuple[str, str]:
+def _judge(m: PriorMeasures) -> tuple[str, str]:
     needles = f"{m.needle:.1%} of the Gaussians are needles"
     if m.is_lift:
         return "lift", "thin discs of equal proportions and colours without view dependence: not trained yet"

@@ -66,7 +66,7 @@ def drop_damaged(path: Path) -> None:
         path.unlink()
 
 
-def steps_at(path: Path) -> int | None:
+def count_steps(path: Path) -> int | None:
     """Return the steps of a recovery's checkpoint, None if it is of a finished round or cannot be read."""
     try:
         with np.load(path) as file:
@@ -77,7 +77,7 @@ def steps_at(path: Path) -> int | None:
 
 
 @contextmanager
-def deferred_interrupt() -> Iterator[threading.Event]:
+def defer_interrupt() -> Iterator[threading.Event]:
     """Turn Ctrl-C (and SIGTERM in the program) into an event that the loop checks between steps.
 
     If no check has seen it, the end of the context raises KeyboardInterrupt.

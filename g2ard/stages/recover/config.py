@@ -30,7 +30,7 @@ _UNTRAINED_RMSE = 0.1
 """Initial RMSE above which a scene counts as untrained, so that large Gaussians must move."""
 
 _SIGHT_SAMPLE = 4096
-"""Gaussians that `steps_for` measures views with."""
+"""Gaussians that `count_steps_for_renders` measures views with."""
 
 _USUAL_VIEWS = 112
 """Usual views that train if each holds the whole scene."""
@@ -54,8 +54,8 @@ class Rates(Settings):
 
     Large Gaussians hardly move: with σ the largest standard deviation in the view as a share of the image's
     longer side, rates of means and rotations are multiplied by 1/(1 + (σ/reach)¹⁶), and that of each scale by
-    the same for its own axis (`recover.losses.extents`). Otherwise many layers moving together, such as a
-    sky's, would move the image by the sum of their steps.
+    the same for its own axis (`recover.losses.measure_extents`). Otherwise many layers moving together, such
+    as a sky's, would move the image by the sum of their steps.
 
     Gaussians below a pixel hardly move either: the same rates are multiplied by σ²/(σ² + finest²), with σ in
     pixels before dilation. Adam divides by the gradient's own size, and would otherwise move what a view
@@ -99,8 +99,8 @@ class Schedule(Settings):
             scales, and thus independent of the scene's unit.
         final_rate: rates fall in a straight line to this share; None keeps geometry rates constant.
         appearance_decay: shares (rounds, final) to which appearance rates decay exponentially; 1 keeps them.
-        multiplier: factor on all rates; None chooses it by short trials, starting at `multiplier_for`.
-        reach: see `Rates`; None chooses it from the initial error (`reach_for`).
+        multiplier: factor on all rates; None chooses it by short trials, starting at `guess_multiplier`.
+        reach: see `Rates`; None chooses it from the initial error (`choose_reach`).
         finest: see `Rates`. `distill` takes 0 for points found in photos, unless it is set.
         momentum: Adam's β₁, the share of its mean gradient that a step keeps.
         reference_extent: `rates.means` is scaled by the cameras' extent (`Cameras.extent`) over this, so that
@@ -213,40 +213,40 @@ SCHEDULES: dict[str, Schedule] = {
 }
 
 
-def multiplier_for(start_rmse: float, least: float = 1 / 3) -> float:
+def guess_multiplier(start_rmse: float, least: float = 1 / 3) -> float:
     """Guess the rate multiplier from the RMSE before recovery: 1 from 0.039 up, a third from 0.013 down.
 
     Better starts need smaller steps. Trials start at no less than a third (`least`); without time for trials,
     nearly fitted starts need less.
 
-    >>> multiplier_for(0.05), round(multiplier_for(0.026), 3), round(multiplier_for(0.001), 3)
+    >>> guess_multiplier(0.05), round(guess_multiplier(0.026), 3), round(guess_multiplier(0.001), 3)
     (1.0, 0.667, 0.333)
     """
     return min(1.0, max(least, start_rmse / 0.039))
 
 
-def reach_for(start_rmse: float, typical: float) -> float:
-    """Return the reach for a start: .01, or the `typical_share` if larger; infinite for an untrained start.
+def choose_reach(start_rmse: float, typical: float) -> float:
+    """Return the reach for a start: .01, or the typical share if larger; infinite for an untrained start.
 
-    >>> reach_for(0.02, 0.005), reach_for(0.05, 0.04), reach_for(0.15, 0.005)
+    >>> choose_reach(0.02, 0.005), choose_reach(0.05, 0.04), choose_reach(0.15, 0.005)
     (0.01, 0.04, inf)
     """
     return max(_DEFAULT_REACH, typical) if start_rmse < _UNTRAINED_RMSE else math.inf
 
 
-def steps_from_points(count: int, steps: int) -> int:
+def count_steps_from_points(count: int, steps: int) -> int:
     """Return `steps` times √(count / 1,250), or `steps` if that is more, for a start from points of photos.
 
     Such points are misplaced by a length that does not depend on their count. A mean moves by a share of its
     radius per step, and radii shrink with the root of the count, so that the way takes as many more steps.
 
-    >>> steps_from_points(1_000, 1000), steps_from_points(20_000, 1000), steps_from_points(20_000, 300)
-    (1000, 4000, 1200)
+    >>> [count_steps_from_points(*case) for case in ((1_000, 1000), (20_000, 1000), (20_000, 300))]
+    [1000, 4000, 1200]
     """
     return round(steps * math.sqrt(max(1.0, count / _FEW_POINTS)))
 
 
-def steps_for(scene: Splats, cameras: Cameras, steps: float) -> int:
+def count_steps_for_renders(scene: Splats, cameras: Cameras, steps: float) -> int:
     """Return the steps for views against renders, one to three times `steps`.
 
     The least are for 140 views, each used about six times. However many usual views there are, they count as
@@ -257,7 +257,7 @@ def steps_for(scene: Splats, cameras: Cameras, steps: float) -> int:
     >>> line = Splats.create([[0, 0, 0], [9, 0, 0], [0, 0, 9], [-9, 0, 0]], scales=np.ones((4, 3)))
     >>> K = [[50, 0, 32], [0, 50, 32], [0, 0, 1]]
     >>> view = Cameras.from_lists([look_at([0, -3, 0], [0, 0, 0])], [K], [(64, 64)], ["a"])
-    >>> steps_for(line, view, 800)
+    >>> count_steps_for_renders(line, view, 800)
     1280
     """
     usual = cameras.usual()
@@ -337,7 +337,7 @@ class RecoverConfig(FitConfig):
         if self.steps is not None:
             return self.steps
         if schedule.means_in_scales and self.from_points:
-            return steps_from_points(len(scene), schedule.steps)
+            return count_steps_from_points(len(scene), schedule.steps)
         if not schedule.means_in_scales or of_photos:
             return schedule.steps
-        return steps_for(scene, cameras, schedule.steps * schedule.for_renders)
+        return count_steps_for_renders(scene, cameras, schedule.steps * schedule.for_renders)

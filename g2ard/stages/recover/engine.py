@@ -18,13 +18,13 @@ from g2ard.stages.recover.config import Rates
 _MEASURED_VIEWS = 8
 
 
-def radii(splats: Splats) -> NDArray[np.float32]:
+def measure_radii(splats: Splats) -> NDArray[np.float32]:
     """Return (N,) √(s₁·s₂) of the two longer scales s₁ ≥ s₂, with s₂ at least s₁/100: the unit of a mean's
     rate.
 
     With the largest scale as unit, needles would move by several widths.
 
-    >>> radii(Splats.create([[0, 0, 0]], scales=[[9.0, 1e-9, 4.0]])).tolist()
+    >>> measure_radii(Splats.create([[0, 0, 0]], scales=[[9.0, 1e-9, 4.0]])).tolist()
     [6.0]
     """
     middle, largest = longer_axes(splats.scales.astype(np.float64)).T
@@ -32,7 +32,7 @@ def radii(splats: Splats) -> NDArray[np.float32]:
     return np.ascontiguousarray(np.sqrt(middle * largest).astype(np.float32))
 
 
-def typical_share(splats: Splats, cameras: Cameras) -> float:
+def measure_typical_share(splats: Splats, cameras: Cameras) -> float:
     """Return the median of f·s₁/z over Gaussians and a few views, as a share of the longer side.
 
     Views are evenly spaced, and occlusion is ignored. The share is 0 if no view shows a Gaussian.
@@ -41,7 +41,7 @@ def typical_share(splats: Splats, cameras: Cameras) -> float:
     >>> dot = Splats.create([[0, 0, 0]], scales=[[0.1, 0.2, 0.01]])
     >>> views = Cameras.from_lists(
     ...     [look_at([0, -2, 0], [0, 0, 0])], [[[50, 0, 16], [0, 50, 12], [0, 0, 1]]], [(40, 24)], ["v"])
-    >>> round(typical_share(dot, views), 6)  # 50 · 0.2 / 2 = 5 pixels of 40
+    >>> round(measure_typical_share(dot, views), 6)  # 50 · 0.2 / 2 = 5 pixels of 40
     0.125
     """
     cameras = cameras.recentred(splats.offset)
@@ -115,7 +115,7 @@ class FusedEngine:
         self._objective = objective
         start = objective.start
         anchors = objective.anchors
-        units = radii(start) if objective.means_in_scales else None
+        units = measure_radii(start) if objective.means_in_scales else None
         self._trainer = _core.Trainer(arrays_of(start), objective, units)
         self._skipped_before = 0
         self._anchors = (

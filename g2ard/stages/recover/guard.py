@@ -145,13 +145,13 @@ class Guard:
         kept: float | None = 0.0
         self.validation.append({"step": step, "psnr": scores})
         for k in _PRIOR_VIEWS:
-            other = self._judged(blended(self.start, result, views / (views + k)))
+            other = self._judged(blend(self.start, result, views / (views + k)))
             if not other[2] > mean + _LEAST_GAIN:
                 break
             kept = k
             (best, scores, mean) = other
         if (harmful := self.harmful(best)) is not None:
-            other = self._judged(blended(self.start, best, ~harmful))
+            other = self._judged(blend(self.start, best, ~harmful))
             if other[2] > mean:
                 best, scores, mean = other
         gain = mean - self._mean(self.before, self.validation[0]["psnr"])
@@ -185,7 +185,7 @@ class Guard:
             *((None, share) for share in _BLENDS),
         ]
         for k, share in shares:
-            part = blended(self.start, result, share)
+            part = blend(self.start, result, share)
             found = self.others(part)
             if self._gain(found) > most:
                 best = part
@@ -210,7 +210,7 @@ class Guard:
         if self.best is not self.start:
             return self.best, self.best_score, 1.0
         for share in _BLENDS:
-            part = blended(self.start, result, share)
+            part = blend(self.start, result, share)
             value = self.score(part)
             if value > self.before:
                 return part, value, share
@@ -234,7 +234,7 @@ class Guard:
         return {name: getattr(self, name) for name in _STATE}
 
 
-def blended(start: Splats, end: Splats, share: ArrayLike) -> Splats:
+def blend(start: Splats, end: Splats, share: ArrayLike) -> Splats:
     """Blend two scenes of the same Gaussians, each attribute in the space it is optimised in.
 
     `share` is the weight of `end`, one for all or (N,).

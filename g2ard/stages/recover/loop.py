@@ -24,12 +24,12 @@ from g2ard.rendering.targets import RENDERS, Targets, fingerprint_of, kinds_of, 
 from g2ard.scene.shape import needle_share
 from g2ard.scene.splats import Splats
 from g2ard.stages.recover.anchors import Anchors, drift95
-from g2ard.stages.recover.config import RecoverConfig, multiplier_for, reach_for
-from g2ard.stages.recover.engine import FusedEngine, Objective, typical_share
+from g2ard.stages.recover.config import RecoverConfig, choose_reach, guess_multiplier
+from g2ard.stages.recover.engine import FusedEngine, Objective, measure_typical_share
 from g2ard.stages.recover.guard import Guard
 from g2ard.stages.recover.probe import Probe
 from g2ard.stages.recover.report import Regularized
-from g2ard.stages.recover.trials import MULTIPLIERS, Trials, trial_steps
+from g2ard.stages.recover.trials import MULTIPLIERS, Trials, count_trial_steps
 from g2ard.system.cached import cached_property
 from g2ard.system.keys import UNKEYED, key_of, keyed
 
@@ -138,7 +138,7 @@ class Loop:
             frozen=self.frozen,
             relative=len(self.targets.cameras.usual()) < len(self.targets.cameras),
         )
-        engine_class = _engine_class(config.engine)
+        engine_class = _import_engine(config.engine)
         try:
             return engine_class(objective)
         except DeviceError:  # from now on it is the CPU's
@@ -153,17 +153,17 @@ class Loop:
         schedule = self.config.schedule
         limit = self.config.recovery_time
         rmse = 10 ** (-start / 20)
-        typical = typical_share(self.student, self.targets.cameras)
-        self.reach = reach_for(rmse, typical) if schedule.reach is None else schedule.reach
+        typical = measure_typical_share(self.student, self.targets.cameras)
+        self.reach = choose_reach(rmse, typical) if schedule.reach is None else schedule.reach
         if schedule.multiplier is not None:
             self.multiplier = schedule.multiplier
             return
-        self.multiplier = multiplier_for(rmse)
+        self.multiplier = guess_multiplier(rmse)
         if kinds_of(self.targets) == RENDERS and limit is None and self.multiplier > min(MULTIPLIERS):
             return
-        if steps := trial_steps(self.config.horizon, limit):
-            tight = reach_for(0.0, typical) if schedule.reach is None else self.reach
-            with checkpoints.deferred_interrupt() as interrupted:
+        if steps := count_trial_steps(self.config.horizon, limit):
+            tight = choose_reach(0.0, typical) if schedule.reach is None else self.reach
+            with checkpoints.defer_interrupt() as interrupted:
                 trials = Trials(partial(self._trial, steps, interrupted), start, limit)
                 self._choose_by_trials(trials, rmse, tight)
             self.trials = [{"multiplier": m, "psnr": value} for m, value in sorted(trials.scores.items())]
@@ -185,7 +185,7 @@ class Loop:
             if trials.scores.get(best, -math.inf) >= trials.start:
                 self.multiplier = best
             elif nearly_fitted:
-                self.multiplier = min(best / 3, multiplier_for(rmse, 0.01))
+                self.multiplier = min(best / 3, guess_multiplier(rmse, 0.01))
 
     def _trial(self, steps: int, interrupted: Event, multiplier: float, end: float) -> float:
         """Return the PSNR after a few steps from the start; raise TimeoutError at `end` (monotonic)."""
@@ -254,7 +254,7 @@ class Loop:
         earlier = self.seconds
         began = time.monotonic()
         saved = time.monotonic()
-        with checkpoints.deferred_interrupt() as interrupted:
+        with checkpoints.defer_interrupt() as interrupted:
             while self._used_share() < 1 and self.guard.stopped is None:
                 self._step()
                 self._look()
@@ -354,11 +354,11 @@ class Loop:
         return [float(part.mean()) for part in np.array_split(np.array(self.losses), 100) if len(part)]
 
     def _view(self, step: int) -> int:
-        """Return the view of a step; each epoch has a new random order, see `drawn`."""
+        """Return the view of a step; each epoch has a new random order, see `draw_views`."""
         count = len(self.targets.cameras)
         epoch, position = divmod(step, count)
         if self._epoch is None or self._epoch[0] != epoch:
-            self._epoch = epoch, drawn(self.config.seed, epoch, count, self.weights)
+            self._epoch = epoch, draw_views(self.config.seed, epoch, count, self.weights)
         return int(self._epoch[1][position])
 
     def _meta(self) -> dict[str, Any]:
@@ -388,12 +388,12 @@ class Loop:
             setattr(self, name, meta[name])
 
 
-def finite(reach: float) -> float | None:
+def write_finite(reach: float) -> float | None:
     """Return `reach`, or None for infinity, which JSON lacks."""
     return None if math.isinf(reach) else reach
 
 
-def _engine_class(name: str) -> type[Engine]:
+def _import_engine(name: str) -> type[Engine]:
     """Return the engine class of a name in `RecoverConfig.engine`, importing its packages on demand."""
     if name == "fused":
         return FusedEngine
@@ -403,7 +403,7 @@ def _engine_class(name: str) -> type[Engine]:
     return TorchEngine
 
 
-def checked_weights(weights: ArrayLike | None, count: int) -> NDArray[np.float64] | None:
+def check_weights(weights: ArrayLike | None, count: int) -> NDArray[np.float64] | None:
     """Check the weights of `count` views and return them with mean 1; None stays None.
 
     Raises:
@@ -422,15 +422,17 @@ def checked_weights(weights: ArrayLike | None, count: int) -> NDArray[np.float64
     return values / values.mean()
 
 
-def drawn(seed: int, epoch: int, count: int, weights: NDArray[np.float64] | None = None) -> NDArray[np.int64]:
+def draw_views(
+    seed: int, epoch: int, count: int, weights: NDArray[np.float64] | None = None
+) -> NDArray[np.int64]:
     """Return the `count` views of an epoch, in a random order that depends only on the arguments.
 
-    Without weights, every view appears once. With (count,) weights w from `checked_weights`, view v appears
+    Without weights, every view appears once. With (count,) weights w from `check_weights`, view v appears
     ⌊w_v⌋ or ⌈w_v⌉ times, w_v on average (systematic sampling). This is far less noisy than independent draws,
     and equal weights change no bit.
 
     >>> import numpy as np
-    >>> np.bincount(drawn(0, 0, 4, np.array([2.0, 1.0, 1.0, 0.0]))).tolist()
+    >>> np.bincount(draw_views(0, 0, 4, np.array([2.0, 1.0, 1.0, 0.0]))).tolist()
     [2, 1, 1]
     """
     views = np.arange(count)

@@ -14,7 +14,7 @@ from g2ard.stages.recover.anchors import Anchors, Regularizers
 
 
 @torch.no_grad()
-def extents(
+def measure_extents(
     means: Tensor, quats: Tensor, log_scales: Tensor, cameras: Cameras, view: int, near: float
 ) -> tuple[Tensor, Tensor]:
     """Return squared sizes on the screen before dilation, px²; 0 behind the near plane.
@@ -39,7 +39,7 @@ def extents(
     depth = torch.where(seen, camera[:, 2], 1.0)[:, None]
     ray = (camera[:, :2] / depth).clamp(low, high)
     to_screen = focal[:, None] * (pose[:2, :3] - ray[..., None] * pose[2, :3]) / depth[..., None]
-    axes = to_screen @ rotations(quats) * log_scales.exp()[:, None]  # (N, 2, 3)
+    axes = to_screen @ build_rotations(quats) * log_scales.exp()[:, None]  # (N, 2, 3)
     x, y = axes.unbind(1)
     xx = (x * x).sum(1)
     xy = (x * y).sum(1)
@@ -55,7 +55,7 @@ def share_of_rate(variance: Tensor, reach: float, finest: float = 0.0) -> Tensor
     return seen / (1 + ratio**8)
 
 
-def rotations(quats: Tensor) -> Tensor:
+def build_rotations(quats: Tensor) -> Tensor:
     """Return (N, 3, 3) matrices of (N, 4) wxyz quaternions of any length, differentiably."""
     w, x, y, z = normalize(quats, dim=1).unbind(1)
     rows = [
@@ -115,7 +115,7 @@ def anchor_loss(means: Tensor, anchors: Anchors) -> Tensor:
 def shape_loss(log_scales: Tensor, quats: Tensor, anchors: Anchors, weights: Regularizers) -> Tensor:
     """Return (1/N) Σ max(0, −log(r_eff − 1 + ε)) + β[log s⊥ − log s̄⊥]₊, with s⊥ along the anchor's normal."""
     normal, r_perp = (torch.from_numpy(a).to(quats) for a in (anchors.frames[:, :, 2], anchors.r_perp))
-    extent = torch.einsum("nji,nj->ni", rotations(quats), normal) * log_scales.exp()
+    extent = torch.einsum("nji,nj->ni", build_rotations(quats), normal) * log_scales.exp()
     thickness = extent.square().sum(1).clamp_min(1e-38).log() / 2 - r_perp.log()
     total = weights.thickness * thickness.clamp_min(0)
     if weights.effective_rank:

@@ -20,8 +20,8 @@ from g2ard.scene.splats import Splats, unit_quats
 from g2ard.stages.recover.anchors import Anchors, drift95
 from g2ard.stages.recover.config import RecoverConfig
 from g2ard.stages.recover.guard import Guard
-from g2ard.stages.recover.loop import Loop, Watch, checked_weights, finite
-from g2ard.stages.recover.probe import Probe, harmful_changes, score_by_kind
+from g2ard.stages.recover.loop import Loop, Watch, check_weights, write_finite
+from g2ard.stages.recover.probe import Probe, find_harmful_changes, score_by_kind
 from g2ard.stages.recover.report import Gain, Geometry, Look, RecoverReport, Trial, Validation
 from g2ard.system.shown import Shown
 
@@ -101,7 +101,7 @@ def recover(
     probe = Probe(targets, config.background)
     progress(stage, 0, 0)
     before = probe.all_of(student)
-    view_weights = checked_weights(weights, len(targets.cameras))
+    view_weights = check_weights(weights, len(targets.cameras))
     exact = skip_same and before >= _SAME_PSNR and config.schedule.guarded
     validation = None if exact else validation
     others = None if validation is None else score_by_kind(validation, config.background)
@@ -109,7 +109,7 @@ def recover(
     def harmful(scene: Splats) -> NDArray[np.bool_] | None:
         if validation is None:
             return None
-        return harmful_changes(student, scene, validation, targets, config.background)
+        return find_harmful_changes(student, scene, validation, targets, config.background)
 
     guard = Guard(probe.all_of, student, before, others, harmful, config.schedule.guarded)
     validation_key = None if validation is None else fingerprint_of(validation)
@@ -136,7 +136,7 @@ def recover(
             blend = float(result is not student)
     validated = None
     if validation is not None:
-        shrunk = None if prior_views is None else finite(prior_views)
+        shrunk = None if prior_views is None else write_finite(prior_views)
         validated = Validation(tuple(map(Look.of, guard.validation)), shrunk)
     return Recovered(
         result,
@@ -146,7 +146,7 @@ def recover(
             loss=loop.curve(),
             psnr=Gain(guard.before, after, probe.scored_in),
             multiplier=loop.multiplier,
-            reach=finite(loop.reach),
+            reach=write_finite(loop.reach),
             extent=targets.cameras.extent,
             trials=tuple(map(Trial.of, loop.trials)),
             drift95=drift95(anchors, result.means),
@@ -161,13 +161,13 @@ def recover(
             skipped={"non_finite": loop.skipped},
             exposure=None if loop.exposures is None else Exposure.over(loop.exposures, targets),
             resumed=loop.resumed,
-            planned=_planned(config, student, targets) if limited else None,
+            planned=_count_planned_steps(config, student, targets) if limited else None,
             pace=pace,
         ),
     )
 
 
-def _planned(config: RecoverConfig, student: Splats, targets: Targets) -> int:
+def _count_planned_steps(config: RecoverConfig, student: Splats, targets: Targets) -> int:
     """Return the steps that a recovery takes without a time limit."""
     if not config.final:
         return config.horizon

@@ -97,7 +97,7 @@ def score_by_kind(
     return lambda splats: {kind: probe.all_of(splats) for kind, probe in probes.items()}
 
 
-def harmful_changes(
+def find_harmful_changes(
     start: Splats,
     result: Splats,
     validation: Targets,

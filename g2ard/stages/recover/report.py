@@ -130,15 +130,15 @@ class RecoverReport(Report):
         return f"RecoverReport({plural(self.steps, 'step')} in {self.seconds:.1f} s, {self.psnr})"
 
 
-def outcome(report: RecoverReport) -> str | None:
+def describe_outcome(report: RecoverReport) -> str | None:
     """Return a message about an unusual recovery, or None.
 
     >>> from dataclasses import replace
     >>> rest = [(), Regularized(1, 0.0, 100), (), None, 1.0, False, None, {}]
     >>> well = RecoverReport(90, 1.0, [], Gain(32.9, 33.4), 1.0, None, 0.0, (), 0.0, 0.0, *rest)
-    >>> outcome(well) is None
+    >>> describe_outcome(well) is None
     True
-    >>> outcome(replace(well, backed_off=(Look(30, 23.35),)))
+    >>> describe_outcome(replace(well, backed_off=(Look(30, 23.35),)))
     'recovery fell to 23.35 dB (start 32.90) at step 30: continued from the best scene with a third of the
     rates'
     """
@@ -173,15 +173,15 @@ def outcome(report: RecoverReport) -> str | None:
     return None
 
 
-def cut_short(report: RecoverReport) -> str | None:
+def describe_time_limit(report: RecoverReport) -> str | None:
     """Return a message if time ended a recovery before its usual steps, and whether it still gained.
 
     >>> from dataclasses import replace
     >>> rest = [(), Regularized(1, 0.0, 100), (), None, 1.0, False, None, {}]
     >>> full = RecoverReport(827, 1.0, [], Gain(20, 28), 1.0, None, 0.0, (), 0.0, 0.0, *rest)
-    >>> cut_short(replace(full, planned=2100, pace=0.41))
+    >>> describe_time_limit(replace(full, planned=2100, pace=0.41))
     'time ended recovery at step 827 of 2,100; it was still gaining 0.4 dB per 100 steps'
-    >>> cut_short(full) is cut_short(replace(full, planned=800)) is None
+    >>> describe_time_limit(full) is describe_time_limit(replace(full, planned=800)) is None
     True
     """
     if report.planned is None or report.steps >= report.planned or report.kept_start or report.stopped:
@@ -194,7 +194,7 @@ def cut_short(report: RecoverReport) -> str | None:
     return f"{text}; it was still gaining {report.pace:.1f} dB per 100 steps"
 
 
-def unregularized(rounds: Sequence[Sequence[RecoverReport]]) -> str | None:
+def describe_idle_regularizers(rounds: Sequence[Sequence[RecoverReport]]) -> str | None:
     """Return a message if regularisers never acted because there were too few steps, or None.
 
     Args:

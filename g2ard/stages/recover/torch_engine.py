@@ -14,8 +14,8 @@ from torch import Tensor
 import g2ard._core as _core
 from g2ard.scene.splats import Splats
 from g2ard.stages.recover.config import Rates
-from g2ard.stages.recover.engine import LEAST_LOSS, TYPICAL_LOSS, Objective, radii
-from g2ard.stages.recover.losses import extents, l1_ssim, regularization, share_of_rate
+from g2ard.stages.recover.engine import LEAST_LOSS, TYPICAL_LOSS, Objective, measure_radii
+from g2ard.stages.recover.losses import l1_ssim, measure_extents, regularization, share_of_rate
 from g2ard.stages.recover.rasterize import rasterize
 
 
@@ -84,8 +84,9 @@ def _one_thread() -> Iterator[None]:
 class TorchEngine:
     """`FusedEngine` in torch, with the moments of `SelectiveAdam`.
 
-    With `means_in_scales` the means are optimised as multiples of each Gaussian's initial radius (`radii`):
-    Adam ignores the scale of gradients, so a rate of 0.05 moves a Gaussian by 5 % of its size.
+    With `means_in_scales` the means are optimised as multiples of each Gaussian's initial radius
+    (`measure_radii`): Adam ignores the scale of gradients, so a rate of 0.05 moves a Gaussian by 5 % of its
+    size.
     """
 
     def __init__(self, objective: Objective) -> None:
@@ -93,7 +94,7 @@ class TorchEngine:
         splats = objective.start
         self._settings = objective.settings
         self._base = torch.from_numpy(splats.means.astype(np.float32))
-        unit = radii(splats) if objective.means_in_scales else np.ones(len(splats), np.float32)
+        unit = measure_radii(splats) if objective.means_in_scales else np.ones(len(splats), np.float32)
         self._unit = torch.from_numpy(unit[:, None])
         start = {
             "means": np.zeros((len(splats), 3), np.float32),
@@ -144,7 +145,7 @@ class TorchEngine:
         p = self._parameters
         near = self._settings.near_of(view)
         cameras = self._objective.cameras
-        largest, axes = extents(means, p["quats"], p["log_scales"], cameras, view, near)
+        largest, axes = measure_extents(means, p["quats"], p["log_scales"], cameras, view, near)
         pixels = rates.reach * float(max(cameras.widths[view], cameras.heights[view]))
         whole, own = (share_of_rate(sizes, pixels, rates.finest) for sizes in (largest, axes))
         return {"means": whole[:, None], "quats": whole[:, None], "log_scales": own}

@@ -114,12 +114,12 @@ class Trials:
         return self.scores[multiplier]
 
 
-def trial_steps(horizon: int, limit: float | None) -> int:
+def count_trial_steps(horizon: int, limit: float | None) -> int:
     """Return the steps of one trial: 20 under a time limit, otherwise 10 to 60, a fiftieth of the horizon.
 
     0 means no trials, because they would take too large a part of a horizon below 100.
 
-    >>> [trial_steps(horizon, None) for horizon in (50, 300, 1000, 6000)]
+    >>> [count_trial_steps(horizon, None) for horizon in (50, 300, 1000, 6000)]
     [0, 10, 20, 60]
     """
     if limit is not None:
