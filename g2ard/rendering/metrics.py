@@ -1,6 +1,5 @@
 """Scores of float images in [0, 1]: PSNR, PSNR and correlation of gradients, lost detail, SSIM, LPIPS."""
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -46,14 +45,10 @@ def edge_psnr(image: _Image, target: _Image, mask: NDArray[np.bool_] | None = No
     >>> edge_psnr(flat, shifted), round(edge_psnr(flat, line), 2)
     (100.0, 18.75)
     """
-    total = 0.0
-    count = 0
-    for own, wanted in _steps(image, target, mask):
-        total += float(np.square(own - wanted).sum(dtype=np.float64))
-        count += own.size
-    if total == 0 or not count:
+    count, error, *_ = _core.steps(_float32(image), _float32(target), _counts(mask))
+    if error == 0 or not count:
         return 100.0
-    return float(np.minimum(100.0, -10 * np.log10(total / count)))
+    return float(np.minimum(100.0, -10 * np.log10(error / count)))
 
 
 def detail(image: _Image, target: _Image, mask: NDArray[np.bool_] | None = None) -> float:
@@ -72,35 +67,13 @@ def detail(image: _Image, target: _Image, mask: NDArray[np.bool_] | None = None)
     >>> detail(flat, flat + 0.1)
     1.0
     """
-    own_energy = energy = common = 0.0
-    count = 0
-    for own, wanted in _steps(image, target, mask):
-        own_energy += float(np.square(own, dtype=np.float64).sum())
-        energy += float(np.square(wanted, dtype=np.float64).sum())
-        common += float((own.astype(np.float64) * wanted).sum())
-        count += own.size
+    count, _, own, wanted, common = _core.steps(_float32(image), _float32(target), _counts(mask))
     least = max(1, count) * _INVISIBLE**2
-    return float((common + least) / np.sqrt((own_energy + least) * (energy + least)))
+    return float((common + least) / np.sqrt((own + least) * (wanted + least)))
 
 
 _INVISIBLE = 1e-4
 """Difference between neighbouring pixels that nobody sees: a fortieth of a step of 8 bits."""
-
-
-def _steps(
-    image: _Image, target: _Image, mask: NDArray[np.bool_] | None
-) -> Iterator[tuple[NDArray[np.float32], NDArray[np.float32]]]:
-    """Yield differences between neighbouring pixels of both images, along columns, then along rows.
-
-    With a mask, a difference counts if both its pixels do.
-    """
-    if image.shape != target.shape:
-        raise InputError(f"expected the image's shape {image.shape}, got {target.shape}", parameter="target")
-    pair = _float32(image), _float32(target)
-    for near, far in ((np.s_[:-1], np.s_[1:]), (np.s_[:, :-1], np.s_[:, 1:])):
-        counts = np.s_[:] if mask is None else mask[far] & mask[near]
-        own, wanted = ((pixels[far] - pixels[near])[counts] for pixels in pair)
-        yield own, wanted
 
 
 def lost_detail(image: _Image, target: _Image, mask: NDArray[np.bool_] | None = None) -> float:
@@ -117,19 +90,13 @@ def lost_detail(image: _Image, target: _Image, mask: NDArray[np.bool_] | None = 
     >>> lost_detail(stripes, stripes), lost_detail(stripes, flat), lost_detail(flat, stripes) > 1
     (0.0, 0.0, True)
     """
-    own, wanted = (_luminance(pixels) for pixels in (image, target))
-    mean = _boxed(wanted)
-    own, wanted = ((pixels - _boxed(pixels)) / (mean + _GLARE) for pixels in (own, wanted))
-    if mask is not None:
-        own = own * mask
-        wanted = wanted * mask
-    contrast = np.sqrt(_by_region(wanted * wanted))
+    wanted, common = _core.contrasts(_float32(image), _float32(target), _counts(mask)).T
+    contrast = np.sqrt(wanted)
     visible = contrast > _SEEN_CONTRAST
     if not visible.any():
         return 0.0
     contrast = contrast[visible]
-    shown = _by_region(own * wanted)[visible]
-    lost = np.maximum(contrast - shown / contrast, 0)
+    lost = np.maximum(contrast - common[visible] / contrast, 0)
     noticed = _SEEN_CONTRAST * (contrast / _SEEN_CONTRAST) ** _MASKING
     return float(np.quantile(lost / noticed, 0.99))
 
@@ -138,36 +105,6 @@ _SEEN_CONTRAST = 0.015
 """Contrast that is just seen (Weber fraction)."""
 _MASKING = 0.7
 """Exponent of its growth over a contrast that is seen."""
-_GLARE = 0.01
-"""Light that a screen reflects in a room, as a share of its white."""
-_FINE = 9
-"""Side in pixels of the squares whose means are subtracted."""
-_REGION = 32
-"""Side in pixels of regions that are compared."""
-
-
-def _luminance(image: _Image) -> NDArray[np.float64]:
-    """Return the light of a screen that shows an image (display gamma 2.2, weights of Rec. 709)."""
-    light = np.clip(image, 0, 1).astype(np.float64) ** 2.2
-    return light @ np.array([0.2126, 0.7152, 0.0722]) if image.shape[2] == 3 else light.mean(2)
-
-
-def _boxed(pixels: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the means of squares around each pixel; the image's edge is repeated."""
-    padded = np.pad(pixels, _FINE // 2, mode="edge")
-    total = np.pad(padded, ((1, 0), (1, 0))).cumsum(0).cumsum(1)
-    sums = total[_FINE:, _FINE:] - total[:-_FINE, _FINE:] - total[_FINE:, :-_FINE] + total[:-_FINE, :-_FINE]
-    return sums / _FINE**2
-
-
-def _by_region(pixels: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the means of the regions, the last of which may be smaller."""
-    height, width = pixels.shape
-    rows = np.arange(0, height, _REGION)
-    columns = np.arange(0, width, _REGION)
-    sums = np.add.reduceat(np.add.reduceat(pixels, rows, 0), columns, 1)
-    areas = np.diff(rows, append=height)[:, None] * np.diff(columns, append=width)
-    return sums / areas
 
 
 def ssim(image: _Image, target: _Image, mask: NDArray[np.bool_] | None = None) -> float:
@@ -186,12 +123,15 @@ def ssim(image: _Image, target: _Image, mask: NDArray[np.bool_] | None = None) -
     >>> round(ssim(np.eye(16)[:, :, None], np.eye(16)[:, :, None]), 6)
     1.0
     """
-    counts = None if mask is None else np.ascontiguousarray(mask)
-    return _core.ssim(_float32(image), _float32(target), counts)
+    return _core.ssim(_float32(image), _float32(target), _counts(mask))
 
 
 def _float32(image: _Image) -> NDArray[np.float32]:
     return np.ascontiguousarray(image, dtype=np.float32)
+
+
+def _counts(mask: NDArray[np.bool_] | None) -> NDArray[np.bool_] | None:
+    return None if mask is None else np.ascontiguousarray(mask)
 
 
 _MEAN = (-0.030, -0.088, -0.188)

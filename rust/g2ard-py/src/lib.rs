@@ -51,7 +51,7 @@ mod _core {
     #[pymodule_export]
     use crate::spatial::{cast_rays, knn};
     #[pymodule_export]
-    use crate::ssim::{l1_ssim, psnr, ssim_metric};
+    use crate::ssim::{contrasts, l1_ssim, psnr, ssim_metric, steps};
     #[pymodule_export]
     use crate::tile::{PyFrame, PyTileMerging};
     #[pymodule_export]

@@ -1,8 +1,9 @@
-//! `_core.l1_ssim`, `_core.ssim`, `_core.psnr`.
+//! `_core.l1_ssim`, `_core.ssim`, `_core.psnr`, `_core.steps`, `_core.contrasts`.
 
-use g2ard_core::ssim::{self, Loss, Mask, Shape};
+use g2ard_core::ssim::{self, Compared, Loss, Mask, Shape};
 use numpy::{
-    PyArray1, PyArray3, PyArrayMethods, PyReadonlyArray2, PyReadonlyArray3, PyUntypedArrayMethods,
+    PyArray1, PyArray2, PyArray3, PyArrayMethods, PyReadonlyArray2, PyReadonlyArray3,
+    PyUntypedArrayMethods,
 };
 use pyo3::prelude::*;
 
@@ -76,4 +77,37 @@ pub fn ssim_metric(
 pub fn psnr(py: Python<'_>, image: Image<'_>, target: Image<'_>) -> PyResult<f64> {
     let (a, b, shape) = pair(&image, &target)?;
     work::quick(py, || ssim::psnr(a, b, shape))
+}
+
+/// Return sums over the differences g and g′ between neighbouring pixels of an image and its target: count,
+/// Σ (g − g′)², Σ g², Σ g′², Σ g·g′. `mask`: (H, W), pixels that count.
+#[pyfunction]
+#[pyo3(signature = (image, target, mask = None))]
+pub fn steps(
+    py: Python<'_>,
+    image: Image<'_>,
+    target: Image<'_>,
+    mask: Option<PyReadonlyArray2<'_, bool>>,
+) -> PyResult<[f64; 5]> {
+    let (a, b, shape) = pair(&image, &target)?;
+    let counts = optional("mask", &mask)?;
+    let sums = work::quick(py, || Ok(Compared::new(a, b, shape, counts)?.steps()))?;
+    Ok([sums.count, sums.error, sums.own, sums.wanted, sums.common])
+}
+
+/// Return (R, 2): for each region of 32×32 pixels the mean of the target's squared contrast and that of its product
+/// with the image's. `mask`: (H, W), pixels that count.
+#[pyfunction]
+#[pyo3(signature = (image, target, mask = None))]
+pub fn contrasts<'py>(
+    py: Python<'py>,
+    image: Image<'py>,
+    target: Image<'py>,
+    mask: Option<PyReadonlyArray2<'py, bool>>,
+) -> PyResult<Bound<'py, PyArray2<f64>>> {
+    let (a, b, shape) = pair(&image, &target)?;
+    let counts = optional("mask", &mask)?;
+    let found = work::quick(py, || Ok(Compared::new(a, b, shape, counts)?.contrasts()))?;
+    let regions = found.len();
+    PyArray1::from_vec(py, found.into_flattened()).reshape([regions, 2])
 }

@@ -1,13 +1,16 @@
-//! L1 and SSIM: fused forward and backward for training ([`Loss`]), and metrics for reports ([`ssim`], [`psnr`]).
+//! L1 and SSIM: fused forward and backward for training ([`Loss`]), and metrics for reports ([`ssim`], [`psnr`],
+//! [`Compared`]).
 //!
 //! SSIM of Wang et al. (2004): 11×11 Gaussian window, σ 1.5, zero-padded as 3DGS does, values in 0–1, C₁ = 0.01²,
 //! C₂ = 0.03². Images are row-major with interleaved channels, so one channel's neighbour is `channels` values away.
 //! With a mask, windows are weighted by it ([`Mask`]), and both losses are means over the pixels that count.
 
+mod detail;
 mod loss;
 mod mask;
 mod metrics;
 
+pub use detail::{Compared, Steps};
 pub use loss::Loss;
 pub use mask::Mask;
 pub use metrics::{psnr, ssim};
