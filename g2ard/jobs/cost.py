@@ -272,10 +272,10 @@ def _peak_bytes(job: Any, count: int, steps: int, page: bool) -> int:
 
 
 def _target_bytes(views: Sequence[Cameras], teacher: Splats | None) -> int:
-    """Return the bytes of cached targets: renders as float32 or in 16 bits, or photos in 8."""
+    """Return the bytes of cached targets: renders in 16 bits, or photos in 8."""
     values = 3 * sum(int(_pixels(part).sum()) for part in views)
     if teacher is not None:
-        values *= 4 if 4 * values + teacher.nbytes <= CACHE_BYTES else 2
+        values *= 2
     return min(CACHE_BYTES, values)
 
 

