@@ -471,7 +471,7 @@ def unrounded(image: NDArray[np.uint16]) -> NDArray[np.float32]:
 
 
 class TeacherRenders(Cached):
-    """Renders of the dense scene: (H, W, 3) float32, clipped to [0, 1], rounded to 16 bits as they are cached.
+    """Renders of the dense scene: (H, W, 3) float32, clipped to [0, 1], cached in 16 bits.
 
     Args:
         teacher: the dense scene.
