@@ -24,7 +24,7 @@ from g2ard.jobs.budget_search import ResolvedBudget
 from g2ard.jobs.chosen_points import PointChoice
 from g2ard.jobs.clean import without_clutter
 from g2ard.jobs.distill_options import LEAST_RECOVERY_SHARE, DistillOptions
-from g2ard.jobs.doubts import doubts_of_regions, doubts_of_views
+from g2ard.jobs.doubts import doubts_of_merging, doubts_of_views
 from g2ard.jobs.inputs import GivenViews, Views, axes_of, load_scene, make_targets, scorable, split_views
 from g2ard.jobs.memory import RECOVERY_TIMES, TilePlan
 from g2ard.jobs.run_views import Use, is_untouched, pool_times, views_of, within_pixels
@@ -381,7 +381,7 @@ class DistillJob:
         """Return warnings about the views, and about regions of the result."""
         told = doubts_of_views(self.prior, self.views.train.cameras)
         if not self.config.recover.from_points:
-            told += doubts_of_regions(self.prior, done.splats)
+            told += doubts_of_merging(self.prior, done.splats, blind=False)
         if self.views.guess is not None:
             told.append(f"warning: the up direction is a guess ({self.views.guess}); --up X,Y,Z sets it")
         return tuple(told)

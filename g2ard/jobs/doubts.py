@@ -66,16 +66,25 @@ def doubts_of_views(scene: Splats, cameras: Cameras) -> list[str]:
     return told
 
 
-def doubts_of_regions(scene: Splats, small: Splats) -> list[str]:
+def doubts_of_merging(scene: Splats, small: Splats, *, blind: bool) -> list[str]:
+    """Return warnings about the result of a reduction, `blind` if it had no views."""
+    if len(scene) < _FEWEST:
+        return []
+    votes = _votes(scene)
+    found = _doubts_of_regions(scene, small, votes)
+    return found + _doubts_of_distances(votes) if blind else found
+
+
+def _doubts_of_regions(scene: Splats, small: Splats, votes: Votes) -> list[str]:
     """Return a warning if an eighth of the scene, or what is near, lost ten times more than the whole."""
     every = max(1, len(scene) // _REGION_ROWS)
-    before, after = _points(scene)[::every], _points(small)
+    before = _points(scene)[::every]
+    after = _points(small)
     if len(before) < _FEWEST or not len(after):
         return []
     regions = [(before, after)]
     for _ in range(_LEVELS):
         regions = [half for region in regions for half in _halved(*region)]
-    votes = _votes(scene)
     if np.isfinite(votes.radius):
         regions.append((_within(before, votes), _within(after, votes)))
     ratio = len(before) / len(after)
@@ -92,11 +101,8 @@ def doubts_of_regions(scene: Splats, small: Splats) -> list[str]:
     ]
 
 
-def doubt_of_distances(scene: Splats) -> list[str]:
-    """Return a warning if a reduction without views meets a scene with a sky or distant surroundings."""
-    if len(scene) < _FEWEST:
-        return []
-    votes = _votes(scene)
+def _doubts_of_distances(votes: Votes) -> list[str]:
+    """Return a warning if the scene has a sky or distant surroundings."""
     far = float(votes.weights[votes.distances > votes.radius].sum())
     if far <= _FAR:
         return []
@@ -108,7 +114,7 @@ def doubt_of_distances(scene: Splats) -> list[str]:
 
 def _visible(scene: Splats) -> Splats:
     rows = np.flatnonzero(scene.opacities > 1 / 255)
-    some = scene.take(rows[canonical_order(scene, rows)[:_SAMPLE]])
+    some = scene.take(rows[canonical_order(scene, rows, _SAMPLE)])
     return some.take(some.finite_rows())
 
 

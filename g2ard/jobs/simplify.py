@@ -146,13 +146,13 @@ class Reduction:
         """Return warnings about the views, and about regions of a result that is in memory."""
         if not isinstance(small, Splats) or len(small) >= self.total:
             return []
-        from g2ard.jobs.doubts import doubt_of_distances, doubts_of_regions, doubts_of_views  # as above
+        from g2ard.jobs.doubts import doubts_of_merging, doubts_of_views  # as above
 
-        told = doubts_of_regions(self.splats, small)
-        if self.seen is None:
-            return told + doubt_of_distances(self.splats)
+        told = doubts_of_merging(self.splats, small, blind=self.seen is None)
         given = self.cameras is not None or self.given.views is not None
-        return told + (doubts_of_views(self.splats, self.seen) if given else [])
+        if self.seen is not None and given:
+            told += doubts_of_views(self.splats, self.seen)
+        return told
 
     def resolved(self, budget: Budget, name: str, file: str, sh_degree: int | None = None) -> ResolvedBudget:
         """Resolve a budget for the scene, called `name` in errors.

@@ -102,7 +102,7 @@ class Matter:
         """
         rows = np.flatnonzero(splats.opacities > 1 / 255)
         visible = len(rows)
-        rows = rows[canonical_order(splats, rows)[:limit]]
+        rows = rows[canonical_order(splats, rows, limit)]
         represents *= visible / max(1, len(rows))
         if len(rows):
             rows = rows[splats.take(rows).finite_rows()]

@@ -276,7 +276,7 @@ def _within_arc(angles: Floats, seen: Floats) -> Floats:
 
 def _survey(splats: Splats, size: tuple[int, int], axis: ArrayLike | None) -> Survey:
     rows = np.flatnonzero(splats.opacities > 1 / 255)
-    some = splats.take(rows[canonical_order(splats, rows)[:_ROWS]])
+    some = splats.take(rows[canonical_order(splats, rows, _ROWS)])
     represents = len(rows) / max(1, len(some))
     some = some.take(some.finite_rows()) if len(some) else some
     return Survey(some, represents, Site.of(some, axis, None, represents), Lens(size))

@@ -133,7 +133,7 @@ class Glance:
 
     def __init__(self, splats: Splats, represents: float = 1.0, limit: int = _ROWS) -> None:
         rows = np.flatnonzero(splats.opacities > 1 / 255)
-        some = rows[canonical_order(splats, rows)[:limit]]
+        some = rows[canonical_order(splats, rows, limit)]
         sample = splats.take(some[splats.take(some).finite_rows()])
         scales = np.sort(sample.scales.astype(np.float64), axis=1)
         self.sizes = np.sqrt(scales[:, 1] * scales[:, 2])

@@ -172,11 +172,11 @@ def merge_equal(points: Floats, colors: NDArray[Any]) -> tuple[NDArray[np.intp],
     return np.sort(firsts), np.stack(totals, axis=1) / np.bincount(group)[:, None]
 
 
-def canonical_order(splats: Splats, rows: NDArray[Any]) -> NDArray[Any]:
+def canonical_order(splats: Splats, rows: NDArray[Any], most: int | None = None) -> NDArray[Any]:
     """Return an order of rows by a hash of opacity, rotation and colour; ties by place and size.
 
     Moving or scaling a scene keeps the order. Sums in it do not depend on the file's row order, and a prefix
-    is a random sample.
+    is a random sample; only the first `most` are returned.
     """
     key = np.zeros(len(rows), np.uint64)
     for block in (splats.logit_opacities[:, None], splats.quats, splats.sh0[:, 0]):
@@ -185,7 +185,10 @@ def canonical_order(splats: Splats, rows: NDArray[Any]) -> NDArray[Any]:
             key ^= bits
             key *= np.uint64(0x9E3779B97F4A7C15)
             key ^= key >> np.uint64(29)
-    order = np.argsort(key)
+    first = np.arange(len(rows))
+    if most is not None and most < len(rows):
+        first = np.flatnonzero(key <= np.partition(key, most)[most])
+    order = first[np.argsort(key[first])]
     same = key[order[1:]] == key[order[:-1]]
     tied = np.append(same, False) | np.append(False, same)
     if tied.any():
@@ -193,4 +196,4 @@ def canonical_order(splats: Splats, rows: NDArray[Any]) -> NDArray[Any]:
         at = rows[among]
         columns = [*splats.scales[at].T, *splats.means[at].T[::-1], key[among]]
         order[tied] = among[np.lexsort(columns)]
-    return order
+    return order[:most]

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from g2ard.io import write_splats
-from g2ard.jobs.doubts import doubt_of_distances, doubts_of_regions, doubts_of_views
+from g2ard.jobs.doubts import doubts_of_merging, doubts_of_views
 from g2ard.poses import plan_pool
 from g2ard.scene.cameras import Camera, Cameras
 from g2ard.scene.splats import Splats
@@ -52,19 +52,19 @@ def test_views_of_a_corner_are_told_of() -> None:
 def test_regions_that_vanish_are_told_of() -> None:
     rng, near = np.random.default_rng(0), np.linalg.norm(UNDER_SKY.means, axis=1) < 100
     fair = UNDER_SKY.take(np.sort(rng.permutation(len(UNDER_SKY))[: len(UNDER_SKY) // 10]))
-    assert doubts_of_regions(UNDER_SKY, fair) == []
+    assert doubts_of_merging(UNDER_SKY, fair, blind=False) == []
     few = np.concatenate([np.flatnonzero(near)[:7], np.flatnonzero(~near)[: len(fair)]])
-    (found,) = doubts_of_regions(UNDER_SKY, UNDER_SKY.take(few))
+    (found,) = doubts_of_merging(UNDER_SKY, UNDER_SKY.take(few), blind=False)
     assert "kept 7 of 11,8" in found
     assert near.sum() == pytest.approx(11_850, abs=50)
     half = YARD.take(np.flatnonzero(YARD.means[:, 0] > 0)[::5])
-    (found,) = doubts_of_regions(YARD, half)
+    (found,) = doubts_of_merging(YARD, half, blind=False)
     assert "kept 0 of" in found
 
 
 def test_far_rows_and_fast_do_not_go_together() -> None:
-    assert doubt_of_distances(YARD) == []
-    assert "far beyond the rest" in doubt_of_distances(UNDER_SKY)[0]
+    assert doubts_of_merging(YARD, YARD, blind=True) == []
+    assert "far beyond the rest" in doubts_of_merging(UNDER_SKY, UNDER_SKY, blind=True)[0]
 
 
 def test_commands_print_and_report_doubts(command_line: CommandLine, tmp_path: Path) -> None:
@@ -95,5 +95,5 @@ def empty() -> Splats:
 def test_nothing_to_doubt() -> None:
     few = YARD.take(range(10))
     assert doubts_of_views(few, looking([(0.0, -9.0, 0.0)])) == []
-    assert doubts_of_regions(few, few.take([0])) == doubt_of_distances(few) == []
-    assert doubts_of_regions(YARD, empty()) == []
+    assert doubts_of_merging(few, few.take([0]), blind=True) == []
+    assert doubts_of_merging(YARD, empty(), blind=False) == []
