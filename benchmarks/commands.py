@@ -146,6 +146,28 @@ def run_(
         )
 
 
+@command(
+    "cambridge",
+    parent=app,
+    example="python -m benchmarks cambridge KingsCollege -o KingsCollege.json",
+)
+def cambridge(
+    run: Run,
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Scene of Cambridge Landmarks.")],
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="OUT.json", help="Views.")],
+) -> None:
+    """Write the views of a scene of Cambridge Landmarks for g2ard."""
+    from benchmarks.cambridge import read
+    from g2ard.io import write_views
+
+    found = read(folder)
+    for note in found.notes:
+        run.say(f"{folder}: {note}")
+    write_views(output, found.cameras, splits=found.splits, overwrite=run.overwrite)
+    run.say(f"{output}: {plural(len(found.cameras), 'view')}")
+    run.result({"views": len(found.cameras), "output": str(output)})
+
+
 def _setting(text: str) -> tuple[str, str]:
     name, found, value = text.partition("=")
     if not found:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property, partial
 from pathlib import Path
@@ -20,15 +20,14 @@ from g2ard.config.choices import Keep
 from g2ard.config.schema import changed
 from g2ard.errors import InputError
 from g2ard.jobs.register import photos_of, poses_for
-from g2ard.pipeline.presets import GS_CPR
 from g2ard.rendering.renderer import Renderer
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats
-from g2ard.stages.register import RegisterConfig, register
+from g2ard.stages.register import PhotoReport, PoseError, RegisterConfig, pose_error, register
 from g2ard.stages.register.pose import rotation_of
-from g2ard.stages.register.report import Accuracy, summarize
+from g2ard.stages.register.report import KEPT
 
-__all__ = ["STARTS", "Register", "displaced"]
+__all__ = ["STARTS", "Register", "displaced", "figures", "result_errors"]
 
 Poses = dict[str, NDArray[np.float64]]
 
@@ -41,8 +40,18 @@ STARTS: dict[str, tuple[float, float] | None] = {
 }
 """Errors of starts: share of the view's median depth, and degrees. D starts from a pool of other views, given
 from the scene's `starts`."""
-_NEAR, _NEARER = 1, 0
-"""Indices of 10 cm/5° and 5 cm/5° in the report's recalls."""
+_RECALLS = {"10": 0.10, "5": 0.05}
+"""Name → limit in metres of a recall, within `_RECALL_DEGREES`."""
+_RECALL_DEGREES = 5.0
+
+GS_CPR: dict[str, Any] = {
+    "register.refine": "none",
+    "register.passes": 1,
+    "register.min_inliers": 6,
+    "register.fallback": False,
+    "register.focal_sigma": 1e-6,
+}
+"""The protocol of GS-CPR: one pass of feature matching, without a fallback."""
 
 
 @dataclass(frozen=True)
@@ -54,8 +63,7 @@ class Register(Study):
         ratios: ratios of maps simplified without recovery; 1 is the original map.
         seeds: seeds of the starts.
         starts: names of `STARTS`.
-        protocol: "g2ard", or "gs-cpr" as `g2ard register --protocol gs-cpr`: one pass of matches, and photos
-            without a pose count where they start.
+        protocol: "g2ard", or "gs-cpr" for `GS_CPR`, in which photos without a pose count where they start.
         metres_per_unit: scale of the scene, for errors in cm and recalls.
     """
 
@@ -88,21 +96,21 @@ class Register(Study):
             config, keep = changed(config, GS_CPR), "all"
         pool = None if starts else site.pool
         began = time.perf_counter()
-        found = register(splats, photos, starts=starts, pool=pool, truth=site.truth, config=config, keep=keep)
+        found = register(splats, photos, starts=starts, pool=pool, config=config, keep=keep)
         seconds = (time.perf_counter() - began) / len(photos)
-        metres = self.metres_per_unit
-        summary = summarize(found.report.photos, keep=keep, true=len(photos), metres_per_unit=metres)
-        assert summary.start is not None
-        assert summary.found is not None
-        scale = 1.0 if metres is None else 100 * metres
-        before, reached = _figures(summary.start, scale), _figures(summary.found, scale)
+        rows = found.report.photos
+        given = starts or dict(zip(site.pool.names, site.pool.viewmats, strict=True))
+        kept = [row for row in rows if row.status in KEPT[keep]]
+        total, metres = len(photos), self.metres_per_unit
+        before = figures(start_errors(rows, given, site.truth), total, metres)
+        reached = figures(result_errors(kept, site.truth), total, metres)
         return [
             {
                 "count": len(splats),
                 "bytes": splats.nbytes,
-                "photos": len(photos),
-                "registered": summary.registered,
-                "uncertain": summary.uncertain,
+                "photos": total,
+                "registered": found.report.count("registered"),
+                "uncertain": found.report.count("uncertain"),
                 **{f"start_{name}": value for name, value in before.items() if name != "worst"},
                 **{name: reached[name] for name in ("position", "rotation", "worst")},
                 **{f"found_{name}": reached[name] for name in ("10", "5")},
@@ -173,11 +181,30 @@ def _depths(splats: Splats, views: Cameras) -> list[float]:
     return out
 
 
-def _figures(accuracy: Accuracy, scale: float) -> dict[str, float | None]:
-    """Return median position and rotation, worst position, and shares within 10 cm and 5 cm."""
-    shares = [accuracy.recalls[i].share if accuracy.recalls else None for i in (_NEAR, _NEARER)]
-    out: dict[str, float | None] = dict(zip(("10", "5"), shares, strict=True))
-    if accuracy.median is None or accuracy.worst is None:
-        return {**out, "position": None, "rotation": None, "worst": None}
-    median, worst = accuracy.median, accuracy.worst.position
-    return {**out, "position": median.position * scale, "rotation": median.rotation, "worst": worst * scale}
+def start_errors(rows: Sequence[PhotoReport], starts: Poses, truth: Poses) -> list[PoseError]:
+    """Return the errors of the poses that photos started from, by the names of the poses."""
+    return [PoseError(*pose_error(starts[row.start], truth[row.name])) for row in rows if row.start]
+
+
+def result_errors(rows: Sequence[PhotoReport], truth: Poses) -> list[PoseError]:
+    """Return the errors of the poses that were found."""
+    poses = [(row.name, np.array(row.camera_from_world)) for row in rows if row.camera_from_world]
+    return [PoseError(*pose_error(pose, truth[name])) for name, pose in poses]
+
+
+def figures(errors: Sequence[PoseError], total: int, metres: float | None) -> dict[str, float | None]:
+    """Return median position and rotation, worst position, and the shares of all photos within limits.
+
+    Positions are in cm if `metres`, the scale of the scene, is known. Photos without a pose count as missed.
+    """
+    values = np.array([(error.position, error.rotation) for error in errors]).reshape(-1, 2)
+    shares: dict[str, float | None] = dict.fromkeys(_RECALLS)
+    for name, limit in _RECALLS.items() if metres is not None else ():
+        within = (values[:, 0] * metres <= limit) & (values[:, 1] <= _RECALL_DEGREES)
+        shares[name] = int(within.sum()) / total
+    if not len(values):
+        return {**shares, "position": None, "rotation": None, "worst": None}
+    scale = 1.0 if metres is None else 100 * metres
+    position, rotation = np.median(values, 0).tolist()
+    worst = float(values[:, 0].max())
+    return {**shares, "position": position * scale, "rotation": rotation, "worst": worst * scale}

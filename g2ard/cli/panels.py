@@ -50,7 +50,7 @@ _PANELS = {
     ),
     "Method": (
         *("method", "preset", "keep_region", "clean", "anchors", "convention"),
-        *("matcher", "refine", "passes", "accept", "protocol"),
+        *("matcher", "refine", "passes", "accept"),
         *("neighbors", "spread", "normal_ratio", "max_anisotropy", "opacity"),
     ),
     "Recovery": (
@@ -58,8 +58,8 @@ _PANELS = {
         *("tolerance", "prior_views", "sh_degree"),
     ),
     "Output": (
-        *("output", "format", "keep", "page", "parents", "resume", "dry_run", "report", "truth"),
-        *("metres_per_unit", "environment", "most", "extent", "least", "layout", "spz_version", "compress"),
+        *("output", "format", "keep", "page", "parents", "resume", "dry_run", "report"),
+        *("environment", "most", "extent", "least", "layout", "spz_version", "compress"),
         *("depth", "around", "fps"),
     ),
     "Geometry": (

@@ -45,7 +45,6 @@ READERS: dict[Kind, dict[str, tuple[str, ...]]] = {
         "colmap": ("cameras.bin", "cameras.txt", "images.bin", "images.txt"),
         "nerfstudio_export": (),
         "transforms": (),
-        "cambridge": (),
         "llff": ("poses_bounds.npy",),
         "polycam": (),
         "inria": (),
@@ -62,7 +61,6 @@ _FOLDERS: dict[str, tuple[str, ...] | None] = {
     "colmap": None,
     "nerfstudio_export": None,
     "transforms": ("transforms.json", *(f"transforms_{split}.json" for split in ("train", "val", "test"))),
-    "cambridge": None,
     "llff": ("poses_bounds.npy",),
     "polycam": None,
     "inria": ("cameras.json",),
@@ -420,7 +418,7 @@ def _unsupported(path: Path) -> str:
     return (
         f"{_NO_FOLDER} (looked for SOG's meta.json, `ingest`'s tiles.json, a COLMAP sparse/0, "
         "transforms.json, cameras.json, LLFF's poses_bounds.npy, Polycam's keyframes, nerfstudio's and "
-        "gsplat's runs, Cambridge's dataset_train.txt)"
+        "gsplat's runs)"
     )
 
 

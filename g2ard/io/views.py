@@ -85,8 +85,8 @@ def read_views(path: str | Path, *, images: str | Path | None = None, split: str
 
     Args:
         path: a COLMAP folder (or its images_4), a transforms.json or its folder, a nerfstudio, gsplat or
-            INRIA run, LLFF's poses_bounds.npy, a Polycam capture, a Cambridge Landmarks scene, a laser scan
-            with photos (.e57), or a .json written by g2ard.
+            INRIA run, LLFF's poses_bounds.npy, a Polycam capture, a laser scan with photos (.e57), or a
+            .json written by g2ard.
         images: folder of the photos, if they have moved.
         split: "train", "test", or "all"; see `g2ard.io.splits.split_mask`.
 

@@ -1,4 +1,4 @@
-"""`g2ard.register`: photos with intrinsics, starting poses and reference poses, then the stage."""
+"""`g2ard.register`: photos with intrinsics and starting poses, then the stage."""
 
 from __future__ import annotations
 
@@ -7,25 +7,23 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
-from typing import Any, Literal, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from g2ard.config.checks import AboveZero, checks_arguments, signature_of
 from g2ard.config.choices import BLACK, Alpha, Colour, Keep, RenderModel
-from g2ard.config.schema import changed, full_paths
 from g2ard.errors import InputError, require
 from g2ard.io import read_view_set
-from g2ard.io.cambridge import read_ace
 from g2ard.io.detect import file_format
 from g2ard.io.finding import photos_in
 from g2ard.io.photo_headers import exif_focal, fits, has_alpha, photo_size
 from g2ard.io.signs import explained
 from g2ard.jobs.inputs import load_scene
-from g2ard.jobs.trajectory import is_trajectory, read_trajectory
+from g2ard.jobs.trajectory import is_trajectory, read_ace, read_trajectory
 from g2ard.jobs.view_checks import propose_background
-from g2ard.pipeline.presets import GS_CPR
+from g2ard.pipeline.presets import configured
 from g2ard.poses import plan_pool
 from g2ard.progress import Progress, Say, plural, silent, unsaid
 from g2ard.scene.cameras import Camera, Cameras
@@ -50,7 +48,6 @@ class RegisterJob:
     photos: Cameras
     starts: dict[str, NDArray[np.float64]]
     pool: Cameras | None
-    truth: dict[str, NDArray[np.float64]]
     config: RegisterConfig
     keep: Keep
     background: Colour
@@ -67,11 +64,9 @@ def prepare(
     *,
     poses: Poses | str | Path | None = None,
     pool: Cameras | str | Path | int | None = None,
-    truth: Poses | str | Path | None = None,
     config: RegisterConfig | None = None,
     settings: Mapping[str, Any] | None = None,
     keep: Keep = "registered",
-    protocol: Literal["gs-cpr"] | None = None,
     split: str = "all",
     intrinsics: str | Path | None = None,
     focal: AboveZero | None = None,
@@ -83,7 +78,7 @@ def prepare(
     say: Say = unsaid,
 ) -> RegisterJob:
     """Read the inputs of `register`, whose arguments these are, and decide everything."""
-    config, keep = configured(config or RegisterConfig(), settings or {}, protocol, keep)
+    config = configured(config or RegisterConfig(), settings=settings)
     taken, posed = photos, True
     if isinstance(taken, Cameras):
         stated = {"intrinsics": intrinsics, "focal": focal, "split": split, "alpha": alpha}
@@ -100,11 +95,11 @@ def prepare(
         raise InputError("photos have no initial pose", path=path, hint="give {poses} or {pool}")
     if poses is None:
         poses = dict(zip(taken.names, taken.viewmats, strict=True)) if pool is None else {}
-    starts, true = (_named(given, taken.names) for given in (poses, truth or {}))
+    starts = _named(poses, taken.names)
     splats = load_scene(scene, say, render_model)
     propose_background(taken, background or BLACK, background is not None, say)
     places = pool if pool is None or isinstance(pool, Cameras) else pool_of(splats, pool, seed, progress, say)
-    return RegisterJob(splats, taken, starts, places, true, config, keep, background or BLACK, progress)
+    return RegisterJob(splats, taken, starts, places, config, keep, background or BLACK, progress)
 
 
 @signature_of(prepare)
@@ -123,11 +118,9 @@ def register(*inputs: Any, **options: Any) -> Registered:
             starts from the photos' own poses, unless there is a pool.
         pool: starting views for photos that are not in `poses`: cameras, their path, or a number of views to
             generate.
-        truth: true poses to score with, given like `poses`; not used otherwise.
         config: options of registration; None means the defaults.
         settings: values of `config` by path, such as {"register.passes": 1}.
         keep: poses to keep: "registered", "uncertain" (both), or "all", which falls back to the start.
-        protocol: "gs-cpr" sets one pass of matches, no refinement, no fallback, and keeps all photos.
         split: split of the views in `photos`.
         intrinsics: for a folder of photos: views with the intrinsics of each photo by name, or the same for
             all.
@@ -154,24 +147,6 @@ def register(*inputs: Any, **options: Any) -> Registered:
     ('refused', 'view 0 (a.png) has no photo; pass views with photos')
     """
     return prepare(*inputs, **options).run()
-
-
-def configured(
-    config: RegisterConfig, settings: Mapping[str, Any], protocol: str | None, keep: Keep
-) -> tuple[RegisterConfig, Keep]:
-    """Return the options with the settings and those of a protocol, which they must not contradict."""
-    settings = full_paths(settings, config)
-    if protocol is None:
-        return changed(config, settings), keep
-    require("protocol", repr(protocol), protocol == "gs-cpr", "gs-cpr")
-    for name in ("passes", "refine"):
-        fixed = GS_CPR[f"register.{name}"]
-        given = settings.get(f"register.{name}", fixed)
-        require(name, given, given == fixed, f"{fixed} with gs-cpr")
-    matcher = settings.get("register.matcher")
-    require("matcher", matcher, matcher != "direct", "matched features with gs-cpr")
-    require("keep", keep, keep != "uncertain", "all with gs-cpr")
-    return changed(config, GS_CPR | settings), "all"
 
 
 def _named(given: Poses | str | Path, names: Sequence[str]) -> dict[str, NDArray[np.float64]]:

@@ -1,17 +1,17 @@
-"""Reader for trajectories of SLAM programs: a time and pose (TUM) or a matrix (KITTI) per line."""
+"""Readers for poses as text: ACE's, and trajectories of SLAM programs (TUM and KITTI)."""
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path, PurePosixPath
 
 import numpy as np
-from numpy.typing import NDArray
 
 from g2ard.errors import InputError
 from g2ard.io.frames import inverse, posed, rigid
 from g2ard.io.jsonfile import Place
 from g2ard.io.paths import read_text
 from g2ard.io.signs import sign_of
+from g2ard.io.types import Float
 
 _UNITS = 10.0 ** np.arange(-9, 10, 3)  # of times, in units of the names of photos
 
@@ -21,29 +21,21 @@ def is_trajectory(path: Path) -> bool:
     return sign is not None and any(word.startswith(b"numbers:") for word in sign.words)
 
 
-def read_trajectory(path: Path, names: Sequence[str]) -> dict[str, NDArray[np.float64]]:
+def read_trajectory(path: Path, names: Sequence[str]) -> dict[str, Float]:
     """Return name → camera_from_world of photos, by the times in their names, otherwise in order.
 
     A line is `time tx ty tz qx qy qz qw`, or the rows of a 3×4 matrix; both are world_from_camera.
     """
-    lines = enumerate(read_text(path).splitlines(), 1)
-    rows = [(number, line.split()) for number, line in lines if line.strip() and line.lstrip()[0] not in "#%"]
-    poses, times = list[NDArray[np.float64]](), list[float]()
-    for number, words in rows:
-        place = Place(path, number, "line")
-        try:
-            values = np.array(words, np.float64)
-        except ValueError:
-            values = np.zeros(0)
-        if len(values) not in (8, 12) or not np.isfinite(values).all():
-            raise place.error("is not a time and a pose, nor a 3×4 matrix")
+    poses, times = list[Float](), list[float]()
+    for place, words in _lines(path):
+        values = _numbers(words)
         if len(values) == 12:
             poses.append(inverse(rigid(values.reshape(3, 4), place)))
-            continue
-        if not values[4:].any():
-            raise place.error("has a quaternion of length zero")
-        poses.append(inverse(posed(values[[7, 4, 5, 6]], values[1:4])))
-        times.append(float(values[0]))
+        elif len(values) == 8:
+            poses.append(inverse(_pose(values[[7, 4, 5, 6]], values[1:4], place)))
+            times.append(float(values[0]))
+        else:
+            raise place.error("is not a time and a pose, nor a 3×4 matrix")
     if found := _by_time(np.array(times), names):
         return {name: poses[row] for name, row in found.items()}
     if len(poses) != len(names):
@@ -53,12 +45,50 @@ def read_trajectory(path: Path, names: Sequence[str]) -> dict[str, NDArray[np.fl
     return dict(zip(sorted(names, key=_numbered), poses, strict=True))
 
 
+def read_ace(path: Path) -> dict[str, Float]:
+    """Read ACE's lines `NAME qw qx qy qz tx ty tz …` as photo → (4, 4) camera_from_world."""
+    poses: dict[str, Float] = {}
+    for place, (name, *words) in _lines(path):
+        values = _numbers(words[:7])
+        if len(values) != 7:
+            raise place.error("is not a name and seven numbers")
+        if name in poses:
+            raise place.error(f"repeats the name {name!r}")
+        poses[name] = _pose(values[:4], values[4:], place)
+    if not poses:
+        raise InputError("no poses found", path=path)
+    return poses
+
+
+def _lines(path: Path) -> Iterator[tuple[Place, list[str]]]:
+    """Yield the words of each line that is neither empty nor a comment."""
+    for number, line in enumerate(read_text(path).splitlines(), 1):
+        words = line.split()
+        if words and words[0][0] not in "#%":
+            yield Place(path, number, "line"), words
+
+
+def _numbers(words: list[str]) -> Float:
+    """Return the words as numbers, or none if one of them is not a finite number."""
+    try:
+        values = np.array(words, np.float64)
+    except ValueError:
+        return np.zeros(0)
+    return values if np.isfinite(values).all() else np.zeros(0)
+
+
+def _pose(quat: Float, translation: Float, place: Place) -> Float:
+    if not quat.any():
+        raise place.error("has a quaternion of length zero")
+    return posed(quat, translation)
+
+
 def _numbered(name: str) -> list[str | int]:
     """Return a key that sorts names by their numbers, such as 2.png before 10.png."""
     return [int(part) if part.isdecimal() else part for part in re.split(r"(\d+)", name)]
 
 
-def _by_time(times: NDArray[np.float64], names: Sequence[str]) -> dict[str, int]:
+def _by_time(times: Float, names: Sequence[str]) -> dict[str, int]:
     """Return name → row of the pose nearest in time, in the unit in which most names have one.
 
     Poses more than half a usual step away do not count.

@@ -35,16 +35,6 @@ PRESETS: dict[str, dict[str, Any]] = {
 }
 """Preset name → values by path. `auto` and `paper` choose their regularisers by measuring the scene."""
 
-GS_CPR: dict[str, Any] = {
-    "register.matcher": "sift",
-    "register.refine": "none",
-    "register.passes": 1,
-    "register.min_inliers": 6,
-    "register.fallback": False,
-    "register.focal_sigma": 1e-6,
-}
-"""The protocol of GS-CPR for `g2ard register`: one pass of feature matching, without a fallback."""
-
 
 def configured(config: Config, preset: str = "auto", settings: Mapping[str, Any] | None = None) -> Config:
     """Apply a preset to a config, then individual settings.

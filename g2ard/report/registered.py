@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -35,7 +35,7 @@ def write_registration_report(
     found: Registered,
     starts: Mapping[str, NDArray[np.float64]],
     side: int,
-    told: Sequence[str],
+    told: str,
     background: Colour,
     overwrite: bool = False,
 ) -> None:
@@ -45,12 +45,11 @@ def write_registration_report(
         found: the registration of all photos, in the same order.
         starts: name → (4, 4) camera_from_world, shown beside the result.
         side: longer side in pixels of the images that its matches refer to.
-        told: summary lines that the command prints.
+        told: summary that the command prints.
     """
     page = Page(title, f"{plural(len(cameras), 'photo')} against {plural(len(scene), 'Gaussian')}")
-    for line in told:
-        page.paragraph(line)
-    columns = ["photo", "status", "ZNCC", "σ position", "σ rotation, °", "error", "error, °", "why"]
+    page.paragraph(told)
+    columns = ["photo", "status", "ZNCC", "σ position", "σ rotation, °", "why"]
     table = [columns, *map(_list_cells, found.report.photos)]
     names, *cells = zip(*(column for column in zip(*table, strict=True) if any(column[1:])), strict=True)
     page.table(names, cells)
@@ -103,6 +102,5 @@ def _list_cells(row: PhotoReport) -> list[str]:
         return "" if value is None else f"{value:.3g}"
 
     sigma = (None, None) if row.sigma is None else (row.sigma.position, row.sigma.rotation)
-    error = (None, None) if row.error is None else (row.error.position, row.error.rotation)
-    figures = [number(value) for value in (row.zncc, *sigma, *error)]
+    figures = [number(value) for value in (row.zncc, *sigma)]
     return [row.name, row.status, *figures, row.reason or ""]

@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 
+from benchmarks import cambridge
 from benchmarks.kinds import matched, worker
 from benchmarks.kinds.matched import Matched
 from benchmarks.kinds.methods import ROUND_STEPS
@@ -43,7 +44,10 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
         dataset_files.mip_nerf_360(root / "mip" / name)
         dataset_files.inria_model(root / "mip/models" / name, SCENE)
     places = blotched(2500)
-    dataset_files.cambridge(root / "cambridge/KingsCollege", (400, 225), places)
+    college = root / "cambridge/KingsCollege"
+    dataset_files.cambridge(college, (400, 225), places)
+    found = cambridge.read(college)
+    write_views(college.with_suffix(".json"), found.cameras, splits=found.splits)
     dataset_files.ace_poses(root / "cambridge/poses_Cambridge_KingsCollege_.txt")
     write_splats(root / "cambridge/KingsCollege.ply", places)
     for name in ("5x", "10x", "20x", "30.3x", "30.3x-no-erank"):

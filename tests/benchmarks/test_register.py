@@ -1,4 +1,4 @@
-"""The study of registration: distances of starts, and recorded results."""
+"""The study of registration: distances of starts, recorded results, and its data set."""
 
 import json
 from dataclasses import replace
@@ -7,10 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.kinds.register import STARTS, displaced
-from g2ard.io import write_splats, write_views
+from benchmarks.kinds.register import STARTS, displaced, figures
+from g2ard.io import read_view_set, write_splats, write_views
 from g2ard.scene.cameras import Cameras
+from g2ard.stages.register import PoseError
 from helpers.commands import CommandLine, refused, succeeds
+from helpers.dataset_files import POSES, cambridge
 from helpers.photos import photographed
 from helpers.scenes import around, checkered_ball
 
@@ -63,3 +65,24 @@ def test_given_starts_and_the_protocol_of_gs_cpr(tmp_path: Path, command_line: C
     (tmp_path / "b.toml").write_text(text + scene)
     told = refused(command_line, tmp_path, "benchmarks", "run", "b.toml", status=1)
     assert "needs the scene's `starts`" in told
+
+
+def test_recalls_count_every_photo() -> None:
+    found = [PoseError(0.02, 1), PoseError(0.045, 1), PoseError(0.3, 1)]
+    assert figures(found, 4, 1) == {"10": 0.5, "5": 0.5, "position": 4.5, "rotation": 1, "worst": 30}
+    assert figures(found, 4, 2)["5"] == 0.25
+    assert figures(found, 4, None) == {"10": None, "5": None, "position": 0.045, "rotation": 1, "worst": 0.3}
+    assert figures([], 4, 1) == {"10": 0, "5": 0, "position": None, "rotation": None, "worst": None}
+
+
+def test_views_of_cambridge_landmarks(tmp_path: Path, command_line: CommandLine) -> None:
+    cambridge(tmp_path / "college")
+    said = succeeds(command_line, tmp_path, "benchmarks", "cambridge", "college", "-o", "college.json").err
+    assert "1 views are not in reconstruction.nvm; they get the median focal length, 1674.0" in said
+    found = read_view_set(tmp_path / "college.json")
+    assert found.splits == ("train",) * 6 + ("test",) * 3
+    np.testing.assert_allclose(found.cameras.viewmats, POSES, atol=1e-7)
+    np.testing.assert_allclose(found.cameras.Ks[0], [[167, 0, 96], [0, 167, 54], [0, 0, 1]])
+    np.testing.assert_allclose(found.cameras.distortions[0], [0.05, 0, 0, 0, 0])
+    assert found.cameras.Ks[4, 0, 0] == pytest.approx(167.4)  # the median, for it is not listed
+    assert all(path.is_file() for path in found.cameras.image_paths)

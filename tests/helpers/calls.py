@@ -276,9 +276,6 @@ VALUES: dict[str, dict[str, str]] = {
         "passes": "1",
         "accept": "0.9",
         "keep": "registered",
-        "protocol": "gs-cpr",
-        "truth": "few.json --json told.json",
-        "metres_per_unit": "2",
         "report": "other.html",
     },
     "info": {
@@ -336,11 +333,9 @@ ON: dict[str, dict[str, str]] = {
     "register": {
         "focal": f"{_REGISTER} --images pair --focal 48 --matcher direct",
         "intrinsics": f"{_REGISTER} --images pair --intrinsics photos.json --matcher direct",
-        "metres_per_unit": f"{CALLS['register']} --truth photos.json --json told.json",
         "accept": f"{_MATCHED} --json told.json",
         "keep": _MATCHED,
         "passes": f"{_MATCHED} --refine none",
-        "protocol": _MATCHED,
         "refine": _MATCHED,
     },
     "info": {"images": "info photos.json --json -"},

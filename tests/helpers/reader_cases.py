@@ -9,7 +9,7 @@ import numpy as np
 from g2ard.io import write_splats, write_views
 from g2ard.tiles.ingest import ingest
 from helpers.cloud_files import columns, las, ply
-from helpers.dataset_files import cambridge, llff, polycam
+from helpers.dataset_files import llff, polycam
 from helpers.packed_files import saved as packed
 from helpers.packed_files import truth, unpacked_ksplat
 from helpers.sog_files import folder as sog_folder
@@ -40,12 +40,6 @@ def run_file(folder: Path, name: str) -> Path:
     """Return a file of a nerfstudio run, or its data."""
     data, run = data_of(folder), run_of(folder)
     return data if name == "transforms.json" else run / name
-
-
-def landmarks(folder: Path, name: str) -> Path:
-    """Return a file of a scene of Cambridge Landmarks."""
-    cambridge(folder / "college")
-    return folder / "college" / name
 
 
 def poses_bounds(folder: Path) -> Path:
@@ -107,8 +101,6 @@ MAKERS: dict[str, Callable[[Path], Path]] = {
     "cameras.txt": lambda f: table(f, "cameras.txt", text=True),
     "images.txt": lambda f: table(f, "images.txt", text=True),
     "points3D.txt": lambda f: table(f, "points3D.txt", text=True),
-    "dataset_train.txt": lambda f: landmarks(f, "dataset_train.txt"),
-    "reconstruction.nvm": lambda f: landmarks(f, "reconstruction.nvm"),
     "poses_bounds.npy": poses_bounds,
     "Polycam": keyframe,
     "transforms": lambda f: transforms(f / "a.json", orbit(2)),
@@ -125,8 +117,6 @@ MAKERS: dict[str, Callable[[Path], Path]] = {
 
 READ = {
     "transforms of a run": "outputs/poster/splatfacto/today",
-    "dataset_train.txt": "college",
-    "reconstruction.nvm": "college",
     "Polycam": "capture",
     "tiles": "tiles",
 }

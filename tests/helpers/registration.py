@@ -3,6 +3,7 @@
 import numpy as np
 
 from benchmarks.kinds.register import displaced as off
+from benchmarks.kinds.register import result_errors
 from g2ard.io.images import resized
 from g2ard.scene.cameras import Camera, Cameras
 from g2ard.stages.register.align import Level, level_of
@@ -10,7 +11,7 @@ from g2ard.stages.register.config import RegisterConfig
 from g2ard.stages.register.grey import grey_of
 from helpers.scenes import checkered_ball
 
-__all__ = ["BALL", "CONFIG", "off", "pyramid_of"]
+__all__ = ["BALL", "CONFIG", "off", "pyramid_of", "result_errors"]
 
 CONFIG = RegisterConfig(size=160, coarsest=40)
 BALL = checkered_ball(2500)

@@ -228,7 +228,6 @@ STAND_INS: dict[str, Callable[[Path], None]] = {
     "small_city": _matrix_city,
     "KingsCollege": _kings_college,
     "KingsCollege.ply": lambda path: g2ard.save(path, blotched(2500)),
-    "poses_Cambridge_KingsCollege_.txt": dataset_files.ace_poses,
     "weights": _lpips,
 }
 """Name → what makes a file or folder of that name."""

@@ -11,7 +11,7 @@ from g2ard import io
 from g2ard.errors import InputError
 from g2ard.io.detect import KINDS, MODULES
 from g2ard.io.photos import load_photo
-from helpers.dataset_files import POSES, cambridge, llff, mip_nerf_360, opengl, polycam
+from helpers.dataset_files import POSES, llff, mip_nerf_360, opengl, polycam
 from helpers.faults import faulty
 from helpers.view_files import photo
 
@@ -65,36 +65,6 @@ def test_mip_nerf_360_at_a_quarter(tmp_path: Path) -> None:
     half = io.read_views(tmp_path, images=tmp_path / "images_2", split="test")
     assert half.names == ("DSC0000.JPG", "DSC0008.JPG")  # every 8th: llffhold
     assert half.widths[0] == 200
-
-
-def test_cambridge_landmarks(tmp_path: Path) -> None:
-    cambridge(tmp_path)
-    found = io.read_view_set(tmp_path)
-    assert found.splits == ("train",) * 6 + ("test",) * 3
-    np.testing.assert_allclose(found.cameras.viewmats, POSES, atol=1e-7)
-    np.testing.assert_allclose(found.cameras.Ks[0], [[167, 0, 96], [0, 167, 54], [0, 0, 1]])
-    np.testing.assert_allclose(found.cameras.distortions[0], [0.05, 0, 0, 0, 0])
-    assert found.cameras.Ks[4, 0, 0] == pytest.approx(167.4)  # the median, for it is not listed
-    assert [note.code for note in found.notes] == ["guessed_focal"]
-    assert len(io.read_views(tmp_path, split="test")) == 3
-    assert io.kind(tmp_path) == "views"
-
-
-def test_cambridges_errors_name_the_line(tmp_path: Path) -> None:
-    cambridge(tmp_path)
-    path = tmp_path / "dataset_test.txt"
-    text = path.read_text()
-    for broken, message in (
-        (text.replace("seq2/frame00007.png", "seq2/frame00007.png x"), "line 5"),
-        (text.replace("seq2/frame00007.png ", ""), "line 5"),
-    ):
-        path.write_text(broken)
-        with pytest.raises(InputError, match=message):
-            io.read_views(tmp_path)
-    path.write_text(text)
-    (tmp_path / "reconstruction.nvm").write_text("nothing")
-    with pytest.raises(InputError, match="NVM_V3"):
-        io.read_views(tmp_path)
 
 
 def test_llff(tmp_path: Path) -> None:

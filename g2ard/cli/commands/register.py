@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated
 
 import typer
 
@@ -14,9 +14,6 @@ from g2ard.config.choices import Keep, Refinement
 from g2ard.config.schema import listed
 from g2ard.errors import InputError
 from g2ard.progress import plural
-
-if TYPE_CHECKING:
-    from g2ard.stages.register.report import Accuracy, Summary
 
 
 @command(
@@ -86,20 +83,6 @@ def register(
     keep: Annotated[
         Keep, typer.Option(help="Photos to write; with all, photos without a pose keep their initial one.")
     ] = "registered",
-    protocol: Annotated[
-        Literal["gs-cpr"] | None,
-        typer.Option(
-            help="gs-cpr: one pass of matches, no refinement and no fallback. Photos with fewer than "
-            "6 matches keep their initial pose. Needs the extra `register`."
-        ),
-    ] = None,
-    truth: Annotated[
-        Path | None, typer.Option(metavar="VIEWS", help="True poses to score against; not used otherwise.")
-    ] = None,
-    metres_per_unit: Annotated[
-        float | None,
-        typer.Option("--metres-per-unit", min=1e-9, help="With --truth: report errors in cm and recall."),
-    ] = None,
     split: Annotated[str, typer.Option(metavar="train|test|all", help="Split of --images VIEWS.")] = "all",
     report: Annotated[
         Path | None,
@@ -112,19 +95,14 @@ def register(
 
     Each photo is registered, uncertain or refused; OUT gets the registered ones as views.
     """
-    from g2ard.jobs.register import configured, prepare
+    from g2ard.jobs.register import prepare
     from g2ard.report.registered import write_registration_report
     from g2ard.stages.register import RegisterConfig
-    from g2ard.stages.register.report import summarize
+    from g2ard.stages.register.report import KEPT
 
-    settings = run.settled(RegisterConfig())[0]
-    with run.usage():
-        config, keep = configured(RegisterConfig(), settings, protocol, keep)
+    config = run.settled(RegisterConfig())[1]
     if config.matcher == "direct":
         run.refuse_typed("with --matcher direct, which matches no features", "refine", "passes")
-    run.config |= {"keep": keep}
-    if metres_per_unit is not None and truth is None:
-        raise typer.BadParameter("--metres-per-unit goes with --truth")
     if intrinsics is not None and focal is not None:
         raise typer.BadParameter("--intrinsics and --focal exclude each other; give one")
     run.claim_views(output, format)
@@ -137,7 +115,6 @@ def register(
         photos,
         poses=poses,
         pool=pool,
-        truth=truth,
         config=config,
         keep=keep,
         split=split,
@@ -151,10 +128,10 @@ def register(
     )
     found = job.run()
     rows = found.report.photos
-    summary = summarize(rows, keep=keep, true=len(job.truth), metres_per_unit=metres_per_unit)
-    lines = _summarize(summary)
-    for line in lines:
-        run.say(line)
+    counts: dict[str, int] = {status: found.report.count(status) for status in KEPT["all"]}
+    told = f"{plural(len(rows), 'photo')}: "
+    told += ", ".join(f"{count} {status}" for status, count in counts.items())
+    run.say(told)
     if len(found.cameras):
         run.write_views(output, found.cameras, format)
     if report is not None:
@@ -170,12 +147,12 @@ def register(
                 found,
                 job.starts,
                 config.size,
-                lines,
+                told,
                 job.background,
                 overwrite=run.overwrite,
             )
     written = str(output) if len(found.cameras) else None
-    result = {**found.report.as_dict(), "summary": summary.as_dict(), "output": written}
+    result = {**found.report.as_dict(), "summary": {"photos": len(rows), **counts}, "output": written}
     run.result({**result, "settings": listed(config)})
     if not len(found.cameras):
         first = next(row for row in rows if row.status != "registered")
@@ -185,31 +162,3 @@ def register(
             "photos, such as the scene's training views",
         )
     run.say(f"{output}: {len(found.cameras)} of {plural(len(rows), 'photo')}")
-
-
-def _summarize(summary: Summary) -> list[str]:
-    counts = f"{summary.registered} registered, {summary.uncertain} uncertain, {summary.refused} refused"
-    scored = (("started from", summary.start), ("found", summary.found))
-    return [
-        f"{plural(summary.photos, 'photo')}: {counts}",
-        *(
-            f"{words}: {_describe_accuracy(accuracy, summary)}"
-            for words, accuracy in scored
-            if accuracy is not None
-        ),
-    ]
-
-
-def _describe_accuracy(accuracy: Accuracy, summary: Summary) -> str:
-    if accuracy.median is None:
-        return f"0 of {summary.true} poses to score"
-    scale = 1.0
-    unit = "units"
-    if summary.metres_per_unit is not None:
-        scale = 100 * summary.metres_per_unit
-        unit = "cm"
-    shares = "".join(f", {r.share:.1%} ≤ {100 * r.metres:g} cm/{r.degrees:g}°" for r in accuracy.recalls)
-    return (
-        f"median {accuracy.median.position * scale:.3g} {unit} / {accuracy.median.rotation:.3g}° "
-        f"over {accuracy.photos} of {summary.true}{shares}"
-    )

@@ -42,7 +42,6 @@ def register(
     *,
     starts: Mapping[str, ArrayLike] | None = None,
     pool: Cameras | None = None,
-    truth: Mapping[str, ArrayLike] | None = None,
     config: RegisterConfig | None = None,
     keep: Keep = "registered",
     background: Sequence[float] = BLACK,
@@ -59,15 +58,14 @@ def register(
     rotated likewise, are most similar: by features from the pose with the most inliers, or by alignment from
     each. The result with the highest median local ZNCC is kept. An unreadable photo gets status "refused".
 
-    Other arguments, results and errors are those of `g2ard.register`; `starts` and `truth` are its poses,
-    name → (4, 4) camera_from_world.
+    Other arguments, results and errors are those of `g2ard.register`; `starts` are its poses, name → (4, 4)
+    camera_from_world.
     """
     config = config or RegisterConfig()
     if not len(photos):
         raise InputError("no photos to register")
     require("keep", repr(keep), keep in KEPT, ", ".join(KEPT))
-    given = _poses("starts", starts, photos)
-    true = _poses("truth", truth, photos)
+    given = _poses(starts, photos)
     if not given and pool is None:
         raise InputError("no photo has a starting pose; pass starting poses or a pool", parameter="starts")
     renderer = Renderer(scene, background=background)
@@ -82,11 +80,11 @@ def register(
         progress("register", i, len(photos))
         began = time.perf_counter()
         start = Start(given[name], given[name], name) if name in given else None
-        row, best = _register_photo(search, photos, i, start, renders, true.get(name))
+        row, best = _register_photo(search, photos, i, start, renders)
         if best is not None and best.solved is not None:
             matches[name] = np.concatenate([best.solved.pixels, best.solved.seen], 1)
         if best is None and keep == "all" and start is not None:
-            row = replace(row, camera_from_world=_rows(start.pose), error=row.start_error)
+            row = replace(row, camera_from_world=_rows(start.pose))
         rows.append(replace(row, seconds=time.perf_counter() - began))
         if row.camera_from_world is not None and row.status in KEPT[keep]:
             kept.append(i)
@@ -105,14 +103,14 @@ def _rows(matrix: Float) -> tuple[tuple[float, ...], ...]:
     return tuple(map(tuple, matrix.tolist()))
 
 
-def _poses(what: str, poses: Mapping[str, ArrayLike] | None, photos: Cameras) -> dict[str, Float]:
+def _poses(poses: Mapping[str, ArrayLike] | None, photos: Cameras) -> dict[str, Float]:
     out = {}
     for name in photos.names:
         if poses and name in poses:
             pose = np.asarray(poses[name], np.float64)
             rigid = pose.shape == (4, 4) and np.isfinite(pose).all()
             if not (rigid and np.allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-6)):
-                raise InputError(f"{name}: not a rigid 4×4 pose", parameter=what)
+                raise InputError(f"{name}: not a rigid 4×4 pose", parameter="starts")
             out[name] = pose
     return out
 
@@ -123,12 +121,10 @@ def _register_photo(
     index: int,
     given: Start | None,
     pool: PoolRenders | None,
-    true: Float | None,
 ) -> tuple[PhotoReport, Candidate | None]:
     """Register one photo from the pose `given`, otherwise from the pool; return its best candidate."""
     name = photos.names[index]
-    start_error = None if given is None or true is None else PoseError(*pose_error(given.pose, true))
-    refused = PhotoReport(name, "refused", start=given.name if given else None, start_error=start_error)
+    refused = PhotoReport(name, "refused", start=given.name if given else None)
     if given is None and pool is None:
         return replace(refused, reason="no pose to start from"), None
     try:
@@ -151,12 +147,7 @@ def _register_photo(
     alike: list[Float] = []
     if search.config.fallback and best.zncc >= min(search.config.doubt, search.config.accept):
         best, alike = search.against_repeats(best, photo)
-    row = _reported(name, best, search.config, search.renders, photos[index].K[0, 0], alike)
-    if true is not None:
-        start_error = PoseError(*pose_error(best.start.pose, true))
-        end_error = PoseError(*pose_error(best.found.viewmat, true))
-        row = replace(row, start_error=start_error, error=end_error)
-    return row, best
+    return _reported(name, best, search.config, search.renders, photos[index].K[0, 0], alike), best
 
 
 def _from_pose(search: Search, given: Start, photo: Photo) -> list[Candidate]:
