@@ -6,7 +6,7 @@ import os
 import sys
 import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
@@ -26,8 +26,6 @@ _SILENT_SECONDS = 1.0
 """Seconds after the end of a stage until the live line says that the command is still working."""
 _STEADY = 1.5
 """Largest ratio of two estimates of a stage's duration, the second after twice the time, that are alike."""
-_ETA_KNOWN_SHARE = 0.1
-"""Share of the expected work after which the time that the whole command still needs is shown."""
 _ECHO = 5
 """Characters left free at the right for ^C, which terminals echo; a line that wraps cannot be removed."""
 _NAME = 10
@@ -122,42 +120,6 @@ class _Stage:
         return elapsed / share * (1 - share) if self.settled and share > 0 else None
 
 
-class _Plan:
-    """The stages that a command expects, in order, with relative times; those that end set the scale.
-
-    >>> plan = _Plan([("targets", 2.0), ("simplify", 1.0), ("recover", 6.0), ("score", 2.0)], 0.0)
-    >>> plan.reach("targets"), plan.reach("recover")  # "simplify" was not needed
-    (None, None)
-    >>> plan.left("recover", 10.0, 0.5, 6.0)  # 16 s for 8 units: 6 s for the rest of recovery, 4 s to score
-    10.0
-    """
-
-    def __init__(self, stages: Sequence[tuple[str, float]], now: float) -> None:
-        self._ahead = list(stages)
-        self._began = now
-        self._current = ("", 0.0)
-        self._done = 0.0
-
-    def reach(self, stage: str) -> None:
-        """Note that a stage begins; those expected before it are over, or not needed."""
-        names = [name for name, _ in self._ahead]
-        if stage in names:
-            row = names.index(stage)
-            self._done += self._current[1]
-            self._current = self._ahead[row]
-            self._ahead = self._ahead[row + 1 :]
-
-    def left(self, stage: str, now: float, share: float, left: float) -> float | None:
-        """Return the seconds that the command still needs, if known."""
-        begun = self._done + self._current[1]
-        rest = sum(weight for _, weight in self._ahead)
-        if stage != self._current[0] or self._done + share * self._current[1] < _ETA_KNOWN_SHARE * (
-            begun + rest
-        ):
-            return None
-        return left + rest * (now - self._began + left) / begun if rest else None
-
-
 class Console:
     """Progress callback (see `g2ard.progress`) and printer of messages.
 
@@ -170,7 +132,6 @@ class Console:
         self._name = name
         self._began = time.monotonic()
         self._stage: _Stage | None = None
-        self._plan: _Plan | None = None
         self._live: Live | None = None
         self._drawn = sys.stderr.isatty() and os.environ.get("TERM") not in ("dumb", "unknown")
         self._ended = threading.Event()
@@ -245,10 +206,6 @@ class Console:
             self._clear()
             print(text, flush=True)
 
-    def expect(self, stages: Sequence[tuple[str, float]]) -> None:
-        """Announce the stages to come, in order, with relative times: the source of the command's ETA."""
-        self._plan = _Plan(stages, time.monotonic())
-
     def __call__(self, stage: str, done: int, total: int, info: Mapping[str, Any] | None = None) -> None:
         """Show the progress of a stage, with the figures of `info`; a total of 0 is unknown."""
         if self.quiet:
@@ -259,8 +216,6 @@ class Console:
             if current is None or current.name != stage or done < current.done or current.ended:
                 self._end_stage()
                 current = self._stage = _Stage(stage, now, done if done < total else 0, printed=now)
-                if self._plan is not None:
-                    self._plan.reach(stage)
             current.done = done
             current.total = total
             current.note(now)
@@ -305,8 +260,6 @@ class Console:
         parts = [f"{stage.name}: {count}".rstrip(), format_duration(now - stage.began)]
         if stage.ended is None and (left := stage.left(now)) is not None:
             parts.append(f"ETA {format_duration(left)}")
-            if (whole := self._whole(stage, now, left)) is not None:
-                parts.append(f"all {format_duration(whole)}")
         print("  ".join([*parts, *stage.figures]), file=sys.stderr, flush=True)
 
     def _draw(self) -> None:
@@ -327,10 +280,6 @@ class Console:
             screen.show_cursor(True)  # so that no end of the process can leave it hidden
         self._live.refresh()
 
-    def _whole(self, stage: _Stage, now: float, left: float) -> float | None:
-        """Return the seconds that the whole command still needs, if known."""
-        return None if self._plan is None else self._plan.left(stage.name, now, stage.share, left)
-
     def _line(self, free: int) -> Table:
         """Return the live line: what matters most of the current stage in as many characters as are free."""
         from rich.progress_bar import ProgressBar
@@ -349,8 +298,6 @@ class Console:
             cells.append(f"{stage.done:,}")
         if stage.ended is None and (left := stage.left(now)) is not None:
             cells.append(f"ETA {_format_clock(left)}")
-            if (whole := self._whole(stage, now, left)) is not None:
-                cells.append(f"all {_format_clock(whole)}")
         cells.append(_format_clock((stage.ended or now) - stage.began))
         while len(cells) > 1 and len("  ".join(cells)) > free:
             cells.pop()

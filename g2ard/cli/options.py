@@ -196,7 +196,7 @@ DryRunOption = Annotated[
         "--dry-run",
         callback=_need_no_output,
         is_eager=True,
-        help="Print the counts and rough time and memory, then exit; needs no -o.",
+        help="Print the counts and rough memory, then exit; needs no -o.",
     ),
 ]
 ResumeOption = Annotated[bool, typer.Option("--resume", help="Continue an interrupted run.")]

@@ -58,14 +58,18 @@ def tell_run(
 
 
 def tell_plan(run: Run, count: int, cost: Cost, plan: TilePlan | None = None) -> None:
-    """Print what a command would do that trains `count` Gaussians, and its rough time and memory."""
+    """Print what a command would do that trains `count` Gaussians, and its rough memory."""
     run.answer(
         f"{plural(count, 'Gaussian')}, {plural(cost.views, 'target image')} of {cost.pixels:,} pixels, "
-        f"{plural(cost.steps, 'step')}: roughly {max(1, cost.seconds):.0f} s on two cores and "
-        f"{describe_memory(cost)}"
+        f"{describe_steps(cost)}: roughly {describe_memory(cost)}"
     )
     run.say_dry()
-    run.result({"count": count, **asdict(cost), "seconds": cost.seconds, **count_tiles(plan)})
+    run.result({"count": count, **asdict(cost), **count_tiles(plan)})
+
+
+def describe_steps(cost: Cost) -> str:
+    """Describe the steps of a job, which a time limit leaves open."""
+    return "as many steps as fit" if cost.steps is None else plural(cost.steps, "step")
 
 
 def describe_memory(cost: Cost) -> str:

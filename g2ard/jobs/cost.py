@@ -1,7 +1,4 @@
-"""Rough time and memory of commands that make scenes, from counts alone.
-
-They serve remaining times, `--dry-run` and `--memory`.
-"""
+"""Rough memory of commands that make scenes, from counts alone, for `--dry-run` and `--memory`."""
 
 from __future__ import annotations
 
@@ -16,8 +13,7 @@ from g2ard.errors import InputError
 from g2ard.io.sog_write import palette_size
 from g2ard.io.tile_store import row_width
 from g2ard.jobs.clean import CLUTTER_SIDE, CLUTTER_VIEWS
-from g2ard.jobs.distill_options import LEAST_RECOVERY_SHARE
-from g2ard.jobs.memory import RECOVERY_TIMES, TileMemory, TilePlan, amount
+from g2ard.jobs.memory import RECOVERY_TIMES, TileMemory, amount
 from g2ard.jobs.run_views import within_pixels
 from g2ard.pipeline.distill import round_counts
 from g2ard.progress import plural
@@ -30,34 +26,8 @@ if TYPE_CHECKING:
     from g2ard.scene.cameras import Cameras
     from g2ard.scene.splats import Splats
 
-_USUAL_PIXELS = 480_000
-"""Pixels of a generated view."""
-_RENDER, _STEP, _SCORE = (0.009, 6e-8), (0.016, 3e-7), (0.02, 7.5e-7)
-"""Seconds per view of these pixels, and per Gaussian: of a target, of a step of recovery, and of scoring a
-scene before and after. Like the next, for two quiet cores, which take about 1 / 1.6 of the CPU time.
-A target of playbot (500,000) takes 52 ms. In CPU time it is 17 ms on guitar (90,854), 27 on 150,000 rows of
-playbot and 38 on taebak_park/0_0 (532,101); scoring a view takes 33 ms on 5,000 Gaussians and 57 on 20,000.
-"""
-_SIMPLIFY, _VISIBILITY, _REPORT, _PAGE = 3e-6, 0.006, 1.5, 1.0
-"""Seconds per Gaussian of simplification, per view for visibility, of the report and of the page. The first
-two take 3.3 s on playbot, and 1.2 and 2.7 s of CPU time on guitar and taebak_park/0_0."""
-
-_TILED = {
-    **{"tiles": 1.5, "coarse": 0.5, "light": 0, "visibility": 3, "costs": 0.2},
-    **{"plans": 0.6, "merge": 0.4, "merged visibility": 0.8, "targets": 1.3},
-}
-"""Microseconds per Gaussian of stages in tiles, in order: half to two thirds of the CPU time of guitar and
-150,000 Gaussians of playbot in tiles of 30,000 and 50,000. In larger tiles, 1 to 100 million Gaussians take
-5 to 7 in all (`docs/benchmarks.md`)."""
-_CLEANING = {"visibility": (0.5, 4e-6), "depths": (0.5, 6e-6), "clutter": (0.5, 0)}
-"""Seconds of the stages of `clean`, and per Gaussian: with `_GROUPING` 46 in all on showroom (2,751,651). In
-CPU time guitar takes 4.7 s, playbot 17.5 and taebak_park/0_0 9.4."""
-_GROUPING = {"needle": 3.5e-6, "floater": 3.5e-6}
-"""Seconds of `clutter` per Gaussian, by the kinds that look for neighbours: 1.1 and 1.3 on playbot."""
 _CLEANING_BYTES = 750
-"""Bytes per Gaussian of `clean`; these three have 700 to 860."""
-_LIGHT = 0.0025
-"""Seconds per view of `light`."""
+"""Bytes per Gaussian of `clean`: 700 to 860 on guitar, playbot and taebak_park/0_0."""
 _IMAGE_FILE_BYTES = 6
 """Bytes per pixel of a render of a scene in tiles in its file."""
 
@@ -94,23 +64,16 @@ class Cost:
     Args:
         views: number of views that need a target, including those for scoring.
         pixels: mean of the training views.
-        steps: of all recoveries.
-        stages: stages to come, in order, with their seconds on two cores.
+        steps: of all recoveries; None if a time limits them.
         bytes: peak memory.
         disk: bytes of files of a scene in tiles, until the result is written.
     """
 
     views: int
     pixels: int
-    steps: int
-    stages: tuple[tuple[str, float], ...]
+    steps: int | None
     bytes: int
     disk: int = 0
-
-    @property
-    def seconds(self) -> float:
-        """Seconds of all stages."""
-        return sum(seconds for _, seconds in self.stages)
 
 
 def cost_of(job: Any, count: int, *, page: bool = True) -> Cost:
@@ -123,84 +86,38 @@ def cost_of(job: Any, count: int, *, page: bool = True) -> Cost:
     train, test = job.views.train.cameras, job.views.test
     apart = 0 if job.views.apart is None else len(job.views.apart)
     pixels = _mean_pixels(train)
-    kept, size = job.is_kept(count), pixels / _USUAL_PIXELS
     views = len(test) + apart + (len(train) if job.recovers else 0)
-    step = _each(_STEP, size, count)
-    steps = 0 if kept or not job.recovers else job.steps(count)
-    steps, recovery = _within(job.config.recover.recovery_time, steps, step)
-    target = _each(_RENDER, size, job.total if job.renders else 0)
-    twice = 4 * len(job.views.twice or ())
-    stages = [("targets", target * (views if steps else len(test) + apart))]
-    if not kept:
-        stages += _merging_stages(job.plan, job.total, len(train), gaps=not job.recovers)
-    scored = len(test) + apart // 2 + twice  # the others validate
-    after = [("scoring", _each(_SCORE, size, count) * scored + target * twice)]
-    after += [("view.html", _PAGE), ("report.html", _REPORT)] if page else []
-    if steps:
-        if job.time is not None:
-            others = job.prepared - job.began + sum(seconds for _, seconds in [*stages, *after])
-            left = max(job.time - others, LEAST_RECOVERY_SHARE * job.time)
-            steps, recovery = _within(left, steps, step)
-        stages.append(("recover", recovery))
-    stages += after
+    trains = job.recovers and not job.is_kept(count)
+    steps: int | None = 0
+    if trains:
+        steps = None if job.config.recover.recovery_time is not None else job.steps(count)
     disk = 0 if job.plan is None else job.plan.disk
     disk += _IMAGE_FILE_BYTES * pixels * views if disk and job.renders else 0
-    return Cost(views, pixels, steps, tuple(stages), _peak_bytes(job, count, steps, page), disk)
-
-
-def _merging_stages(plan: TilePlan | None, total: int, views: int, *, gaps: bool) -> list[tuple[str, float]]:
-    if plan is not None:
-        return _tiled_stages(plan, views, gaps=gaps)
-    return [("visibility", _VISIBILITY * views), ("simplify", _SIMPLIFY * total)]
-
-
-def _within(limit: float | None, steps: int, step: float) -> tuple[int, float]:
-    """Return the steps of `step` seconds within a time limit, if there are any, and their seconds."""
-    if limit is None or not steps:
-        return steps, step * steps
-    return max(1, round(limit / step)), limit
+    return Cost(views, pixels, steps, _peak_bytes(job, count, page, trains=trains), disk)
 
 
 def cost_of_recovery(
     scene: Splats,
     training: Cameras,
-    steps: int,
+    steps: int | None,
     *,
     scored: Cameras | None = None,
     validation: Cameras | None = None,
-    seconds: float | None = None,
     teacher: Splats | None = None,
-    stage: str = "recover",
 ) -> Cost:
     """Return the cost of fitting a scene as it is, by `g2ard recover` or `g2ard adapt`.
 
     Args:
+        steps: of the fit; None if a time limits them.
         scored: views scored before and after.
         validation: further views that need a target.
-        seconds: time limit of the fit instead of the steps' time.
         teacher: scene that renders the targets; None if they are photos.
-        stage: name of the fit in progress messages.
     """
     used = [part for part in (training, scored, validation) if part is not None]
-    pixels, views = _mean_pixels(training), sum(map(len, used))
-    size = pixels / _USUAL_PIXELS
-    stages = [] if teacher is None else [("targets", _each(_RENDER, size, len(teacher)) * views)]
-    steps, fit = _within(seconds, steps, _each(_STEP, size, len(scene)))
-    stages.append((stage, fit))
-    if scored is not None:
-        stages.append(
-            ("scoring", _each(_SCORE, _mean_pixels(scored) / _USUAL_PIXELS, len(scene)) * len(scored))
-        )
     dense = 0 if teacher is None else int(_KEPT_TIMES * teacher.nbytes)
     memory = _PROGRAM_BYTES + _target_bytes(used, teacher) + _image_bytes(used)
     memory += dense + int(_KEPT_TIMES * scene.nbytes) + TRAINER_BYTES * len(scene)
-    return Cost(views, pixels, steps, tuple(stages), memory)
-
-
-def _each(seconds: tuple[float, float], size: float, count: float) -> float:
-    """Return the seconds for a view of `size` times the usual pixels, or for a step on it."""
-    per_view, per_gaussian = seconds
-    return per_view * size + per_gaussian * count
+    return Cost(sum(map(len, used)), _mean_pixels(training), steps, memory)
 
 
 def _mean_pixels(cameras: Cameras) -> int:
@@ -214,43 +131,24 @@ def _pixels(cameras: Cameras) -> NDArray[np.int64]:
 def cost_of_reduction(reduce: Reduction, count: int) -> Cost:
     """Return the cost of simplifying a scene to `count` Gaussians; its views measure visibility."""
     seen = reduce.seen if count < reduce.total else None
-    views, pixels, plan = 0 if seen is None else len(seen), 0, reduce.plan
-    stages = _merging_stages(plan, reduce.total, views, gaps=True)
+    views, plan = 0 if seen is None else len(seen), reduce.plan
     if plan is not None:
-        return Cost(views, pixels, 0, tuple(stages), plan.bytes, plan.disk)
+        return Cost(views, 0, 0, plan.bytes, plan.disk)
     memory = _PROGRAM_BYTES + int(_SCENE_TIMES * reduce.dense.sample.nbytes)
     memory += _sampled(_SURVEY, reduce.total) if views else 0
-    return Cost(views, pixels, 0, tuple(stages), memory)
+    return Cost(views, 0, 0, memory)
 
 
 def cost_of_cleaning(scene: SceneStream, kinds: Sequence[str]) -> Cost:
     """Return the cost of finding some kinds of clutter in a scene, or of only reading it for none."""
     count = scene.count
     if not kinds:
-        return Cost(0, 0, 0, (), _PROGRAM_BYTES + int(_KEPT_TIMES * 4 * row_width(scene.sh_degree) * count))
-    seconds = {name: fixed + each * count for name, (fixed, each) in _CLEANING.items()}
-    seconds["clutter"] += sum(_GROUPING.get(kind, 0) for kind in kinds) * count
+        return Cost(0, 0, 0, _PROGRAM_BYTES + int(_KEPT_TIMES * 4 * row_width(scene.sh_degree) * count))
     memory = _PROGRAM_BYTES + _SURVEY[0] + _CLEANING_BYTES * count
-    return Cost(CLUTTER_VIEWS, CLUTTER_SIDE**2 * 3 // 4, 0, tuple(seconds.items()), memory)
+    return Cost(CLUTTER_VIEWS, CLUTTER_SIDE**2 * 3 // 4, 0, memory)
 
 
-def _tiled_stages(plan: TilePlan, views: int, *, gaps: bool) -> list[tuple[str, float]]:
-    """Return the stages of a simplification in tiles by some views, if any.
-
-    Args:
-        gaps: whether the opacity lost is measured.
-    """
-    done = ["tiles", "coarse"] if plan.written else []
-    done += [] if gaps and views else ["targets"]
-    done += [] if views else ["light", "visibility", "merged visibility"]
-    return [
-        (name, _LIGHT * views + micro * 1e-6 * plan.count if name == "light" else micro * 1e-6 * plan.count)
-        for name, micro in _TILED.items()
-        if name not in done
-    ]
-
-
-def _peak_bytes(job: Any, count: int, steps: int, page: bool) -> int:
+def _peak_bytes(job: Any, count: int, page: bool, *, trains: bool) -> int:
     """Return the peak memory: of simplification, of recovery, or of what is written at the end."""
     given, views, train = job.config.recover.sh_degree, job.views, job.views.train.cameras
     count = round_counts(job.dense, count, job.config)[0]
@@ -258,7 +156,7 @@ def _peak_bytes(job: Any, count: int, steps: int, page: bool) -> int:
     dense, scene, small = len(job.prior), job.prior.nbytes, 4 * row_width(degree) * count
     rows = 0 if job.plan else dense  # that view.html may show
     chosen = job.config.select.count_of(len(train))
-    used = [train if chosen == "auto" else train.take(range(min(chosen, len(train))))] if steps else []
+    used = [train if chosen == "auto" else train.take(range(min(chosen, len(train))))] if trains else []
     used += [part for part in (views.test, views.apart, views.twice) if part is not None]
     full = [] if views.full is None else [within_pixels(views.full)]
     targets = sum(_target_bytes(part, job.prior if job.renders else None) for part in (used, full))

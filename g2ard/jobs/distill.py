@@ -226,22 +226,30 @@ class DistillJob:
     def time_left(self, limit: float) -> float:
         """Return the seconds for recovery, of a limit for the whole run, after all that comes before it.
 
-        What comes after takes as much longer than its usual cost as what came before. Recovery gets at least
-        a twentieth.
+        Scoring comes after it. Recovery gets at least a twentieth.
         """
-        from g2ard.jobs.cost import cost_of
-
-        stages, now = cost_of(self, self.budget.count).stages, time.monotonic()
-        names = [name for name, _ in stages]
-        at = names.index("recover") if "recover" in names else len(names)
-        before, after = (sum(seconds for _, seconds in part) for part in (stages[:at], stages[at + 1 :]))
-        slowness = (now - self.prepared) / before if before else 1.0
-        left = limit - (now - self.began) - slowness * after
-        least = LEAST_RECOVERY_SHARE * limit
+        scoring = self._scoring_seconds()
+        spent = time.monotonic() - self.began
+        left, least = limit - spent - scoring, LEAST_RECOVERY_SHARE * limit
         if left < least:
-            spent = now - self.began
             self.say(f"warning: {limit:g} s are short; after {spent:.1f} s recovery still gets {least:.1f} s")
         return max(left, least)
+
+    def _scoring_seconds(self) -> float:
+        """Measure how long scoring takes: of the scene before and after recovery, in all views for scores.
+
+        The dense scene is rendered in some of them. A result takes less, which leaves time for the pages.
+        """
+        held_out = self.targets.held_out
+        others = (self.targets.apart, self.targets.twice)
+        if not len(held_out.cameras):
+            return 0.0
+        some = Subset(held_out, evenly_spaced(len(held_out.cameras), _TIMED))
+        began = time.monotonic()
+        evaluate(self.prior, some, background=self.config.recover.background)
+        seconds = time.monotonic() - began
+        scored = sum(_count_pixels(targets) for targets in (held_out, *others) if targets is not None)
+        return 2 * seconds * scored / _count_pixels(some)
 
     def _reduced(
         self,
@@ -398,6 +406,10 @@ class DistillJob:
         return None if unseen is None else unseen / self.total
 
 
+def _count_pixels(targets: Targets) -> int:
+    return int(targets.cameras.widths @ targets.cameras.heights)
+
+
 Given = Splats | Points | Source | None
 """Input of a distillation; None starts from photos alone."""
 
@@ -405,6 +417,9 @@ _NO_PHOTOS = "no photos: the lifted points render the training images; photos, g
 
 _SHOWN = 3
 """Views in pictures of a run."""
+
+_TIMED = 8
+"""Views in which scoring is timed."""
 
 _PICTURE = 800
 """Longer side in pixels of a view in these pictures, at least, also after --size."""

@@ -83,14 +83,14 @@ class RecoverJob:
 
     @property
     def cost(self) -> Cost:
-        """Rough time and memory."""
+        """Rough memory."""
+        steps: int | None = self.config.horizon if self.config.recovery_time is None else None
         return cost_of_recovery(
             self.student,
             self.views.cameras,
-            0 if self._same else self.config.horizon,
+            0 if self._same else steps,
             scored=None if self.held_out is None else self.held_out.cameras,
             validation=None if self.validation is None else self.validation.cameras,
-            seconds=self.config.recovery_time,
             teacher=self.teaching.dense,
         )
 

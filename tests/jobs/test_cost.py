@@ -1,4 +1,4 @@
-"""`distill --dry-run`: exact counts, rough seconds and bytes."""
+"""`distill --dry-run`: exact counts and rough bytes."""
 
 import json
 import re
@@ -39,7 +39,6 @@ def test_a_dry_run_counts_and_writes_nothing(folder: Path, command_line: Command
     assert told["steps"] == ran["rounds"][-1]["recover"][-1]["steps"] == 12
     views = len(g2ard.load_views(folder / "run" / "views.json"))
     assert views < told["views"] <= views + 72  # those of other kinds are in no file
-    assert told["seconds"] == sum(seconds for _, seconds in told["stages"]) > 0
     assert told["pixels"] == 48 * 36
 
 
@@ -59,8 +58,6 @@ def test_a_dry_run_plans_tiles_like_the_run(scene: str, tmp_path: Path, command_
     assert told["steps"] == 2
     assert told["views"] >= 4
     assert told["disk"] > 2 * 3000 * 56
-    assert told["seconds"] == pytest.approx(sum(seconds for _, seconds in told["stages"]))
-    assert ("tiles" in dict(told["stages"])) == (not store)
 
 
 @pytest.mark.parametrize("rows", [(), ("--tile-rows", 800, "--workers", 1)])
@@ -71,7 +68,7 @@ def test_a_dry_run_of_simplify(rows: tuple[object, ...], tmp_path: Path, command
     assert [plan["count"] for plan in plans] == [300, 150]
     assert {plan["views"] for plan in plans} == {2}
     assert [plan.get("tiles") for plan in plans] == [4 if rows else None] * 2
-    assert all(plan["seconds"] > 0 and plan["bytes"] > 1e7 for plan in plans)
+    assert all(plan["bytes"] > 1e7 for plan in plans)
     assert {path.name for path in folder.iterdir()} == {"town.ply", "views.json"}
 
 
@@ -87,17 +84,15 @@ def test_a_dry_run_of_levels_plans_tiles(tmp_path: Path, command_line: CommandLi
 
 
 def test_memory_grows_with_views_and_gaussians(monkeypatch: pytest.MonkeyPatch) -> None:
-    options = DistillOptions(size=48, settings={"recovery_time": 7.0})
+    options = DistillOptions(size=48)
     job = prepare(checkered_ball(900), Budget(90), options)
     few, many = cost_of(job, 90), cost_of(job, 450)
     assert few.bytes > 12 * few.views * few.pixels
-    assert dict(few.stages)["recover"] == 7.0
     assert many.bytes > few.bytes
     monkeypatch.setattr("g2ard.jobs.cost._LOOKS", (0, 0))  # packing takes less for a small scene
     both = cost_of(job, 90)  # its page holds the dense scene too
     monkeypatch.setattr("g2ard.jobs.cost.LARGEST_DENSE", 899)
     assert both.bytes > cost_of(job, 90).bytes > cost_of(job, 90, page=False).bytes
-    assert cost_of(job, 90, page=False).seconds < few.seconds == sum(seconds for _, seconds in few.stages)
 
 
 _DISTIL = "--steps 4 --size 200"
@@ -190,15 +185,12 @@ def test_a_dry_run_of_clean_is_of_the_kinds_requested(folder: Path, command_line
         told: dict[str, Any] = json.loads(succeeds(command_line, folder, *ask).out)
         return told
 
-    nothing, giants, needles, whole = (
-        planned(*only) for only in (["--only", "none"], ["--only", "giant"], ["--only", "needle"], [])
-    )
-    assert (nothing["views"], nothing["stages"], nothing["seconds"]) == (0, [], 0)
+    nothing, giants, whole = (planned(*only) for only in (["--only", "none"], ["--only", "giant"], []))
+    assert nothing["views"] == 0
     assert nothing["bytes"] < giants["bytes"]
     assert giants["views"] == whole["views"] > 0
-    assert 0 < giants["seconds"] < needles["seconds"] < whole["seconds"]
     told = succeeds(command_line, folder, "clean", "ball.ply", "--only", "none", "--dry-run").err
-    assert "400 Gaussians: roughly 1 s" in told
+    assert re.search(r"^400 Gaussians: roughly \d+ MB$", told, re.MULTILINE)
     assert "--preview" not in told
     whole_told = succeeds(command_line, folder, "clean", "ball.ply", "--dry-run").err
     for text in (whole_told, succeeds(command_line, folder, "clean", "--help").out):
@@ -214,4 +206,3 @@ def test_a_dry_run_of_a_fit(command: str, folder: Path, command_line: CommandLin
     ran = json.loads(succeeds(command_line, folder, *ask, "-o", "fit.ply").out)
     assert told["count"] == len(g2ard.load(folder / "fit.ply"))
     assert (told["steps"], ran["steps"]) == ((4, 4) if command == "adapt" else (0, 0))  # it is its teacher
-    assert {"targets", command} <= dict(told["stages"]).keys()

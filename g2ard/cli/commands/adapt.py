@@ -73,14 +73,13 @@ def adapt(
     count = len(targets.cameras)
     most = config.most_steps(count)
     first = config.stretches(count)[0]
-    cost = cost_of_recovery(splats, targets.cameras, most, teacher=teaching.dense, stage="adapt")
+    cost = cost_of_recovery(splats, targets.cameras, most, teacher=teaching.dense)
     if dry_run:
         tell_plan(run, len(splats), cost)
         return
     stops = first < most and config.tolerance > 0
     least = f"{first:,} to " if stops else ""
     run.say(f"{plural(count, 'image')}: {least}{plural(most, 'step')}{', as long as they gain' * stops}")
-    run.console.expect(cost.stages)
     with stoppable(run, work, resume, output):
         work.mkdir(parents=True, exist_ok=True)
         result = refit(splats, targets, config, work=work, progress=run.progress)

@@ -82,7 +82,7 @@ def clean(
 
     Visibility is measured from generated views.
 
-    --preview FILE.png without -o shows what would go; --dry-run only estimates time and memory.
+    --preview FILE.png without -o shows what would go; --dry-run only estimates memory.
     """
     from g2ard.jobs.clean import clean as remove_clutter
     from g2ard.jobs.clean import kinds_of
@@ -96,17 +96,14 @@ def clean(
     if output is None and (preview is None or split_sky is not None):
         raise typer.BadParameter("give an output with -o, or only --preview")
     source = Source(scene, run.render_model)
-    cost = cost_of_cleaning(source.scene, wanted)
     if dry_run:
-        _tell_plan(run, source.scene.count, cost)
+        _tell_plan(run, source.scene.count, cost_of_cleaning(source.scene, wanted))
         return
     if preview is not None:
         run.claim_file("--preview", preview)
     for flag, path in (("--output", output), ("--split-sky", split_sky)):
         if path is not None:
             run.claim_scene(flag, path)
-    drawn = [("preview", 1)] if preview is not None else []
-    run.console.expect([*cost.stages, *drawn])
     done = remove_clutter(
         run.load(source),
         only=kinds,
@@ -138,16 +135,13 @@ def clean(
 
 
 def _tell_plan(run: Run, count: int, cost: Cost) -> None:
-    """Print the rough time and memory of cleaning `count` Gaussians."""
+    """Print the rough memory of cleaning `count` Gaussians."""
     views = f", looked at in {cost.views} views" if cost.views else ""
-    run.answer(
-        f"{plural(count, 'Gaussian')}{views}: roughly {max(1, cost.seconds):.0f} s on two cores and "
-        f"{describe_memory(cost)}"
-    )
+    run.answer(f"{plural(count, 'Gaussian')}{views}: roughly {describe_memory(cost)}")
     run.say_dry()
     if cost.views:
         run.say("--preview FILE.png without -o shows what would go")
-    run.result({"count": count, **asdict(cost), "seconds": cost.seconds})
+    run.result({"count": count, **asdict(cost)})
 
 
 def _paint(path: Path, done: Cleaned, cameras: Cameras, overwrite: bool) -> None:

@@ -60,8 +60,6 @@ def compare(
     sources = [Source(path, run.render_model) for path in (first, second)]
     if output is not None:
         run.claim_file("--output", output, page=True)
-    page = [] if output is None else [("output", 1.0), ("sog", 2.0), ("sog", 0.5)]
-    run.console.expect([("poses", 1.0), ("targets", 2.0), ("evaluate", 3.0), *page])
     dense, other = (run.load(source) for source in sources)
     known = opt.background_of(run, background, first, second)
     colour = known or BLACK

@@ -148,7 +148,6 @@ def distill(
             tell_plan(run, job.budget.count, cost, job.plan)
             return
         check_job_memory(job, tiling.memory, cost.bytes)
-        run.console.expect(cost.stages)
         name = scene or Path(str(views))
         with folder.held(job):
             done: Any = job.run(folder.unfinished)

@@ -125,13 +125,6 @@ def evaluate(
         seed=run.seed,
         **run.callbacks,
     )
-    of_targets = [] if teacher is None else [("targets", 2.0)]
-    of_scenes = [
-        stage
-        for path in scenes
-        for stage in ((path.name, 4.0), (f"{path.name} unshrunk", 4.0 if size else 0.0), ("visibility", 1.0))
-    ]
-    run.console.expect([*of_targets, *of_scenes])
     frozen = run.load(anchors) if anchors else None
     found_views = teaching.views(given)
     full = load_views(found_views, split, None, run.say, unpictured=teaching.dense is not None)

@@ -207,9 +207,6 @@ def lod(
         if dry_run:
             _tell_costs(run, job)
             return
-        made = [cost for ratio, cost in zip(job.ratios, job.costs, strict=True) if ratio > 1]
-        stages = [stage for cost in made for stage in cost.stages]
-        run.console.expect([*stages, ("write", 3.0), ("the page", 1.0)])
         if not tiled:
             stopped.mkdir(parents=True, exist_ok=True)
         levels = job.run(tiling.folder / "steps" if tiled else stopped)
@@ -242,22 +239,20 @@ def lod(
 
 
 def _tell_costs(run: Run, job: LevelsJob) -> None:
-    """Print the rough time and memory of each level and of all."""
+    """Print the rough memory of each level and of all."""
+    from g2ard.cli.run_result import describe_memory, describe_steps
+
     levels = []
     for number, (ratio, count, cost) in enumerate(zip(job.ratios, job.counts, job.costs, strict=True)):
         if ratio == 1:
             continue
-        steps = f", {plural(cost.steps, 'step')}" if job.job.recovers else ""
-        run.answer(
-            f"level {number}: {plural(count, 'Gaussian')}{steps}: "
-            f"roughly {max(1, cost.seconds):.0f} s on two cores"
-        )
-        levels.append({"level": number, "count": count, **asdict(cost), "seconds": cost.seconds})
-    seconds = sum(one["seconds"] for one in levels)
+        steps = f", {describe_steps(cost)}" if job.job.recovers else ""
+        run.answer(f"level {number}: {plural(count, 'Gaussian')}{steps}: roughly {describe_memory(cost)}")
+        levels.append({"level": number, "count": count, **asdict(cost)})
     most = max((one["bytes"] for one in levels), default=0)
-    run.answer(f"all levels: roughly {max(1, seconds):.0f} s and {most / 1e6:,.0f} MB")
+    run.answer(f"all levels: roughly {most / 1e6:,.0f} MB")
     run.say_dry()
-    run.result({"levels": levels, "total": {"seconds": seconds, "bytes": most}})
+    run.result({"levels": levels, "total": {"bytes": most}})
 
 
 def _parse_georeference(text: str) -> Georeference | str:

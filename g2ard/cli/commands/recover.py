@@ -83,11 +83,9 @@ def recover(
     )
     if output != opt.UNWRITTEN:
         check_positions(output, job.student)
-    cost = job.cost
     if dry_run:
-        tell_plan(run, len(job.student), cost)
+        tell_plan(run, len(job.student), job.cost)
         return
-    run.console.expect(cost.stages)
     with stoppable(run, checkpoint, resume, output):
         result = job.run(checkpoint)
         run.write(output, result.splats)

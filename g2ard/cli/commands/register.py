@@ -108,8 +108,6 @@ def register(
     run.claim_views(output, format)
     if report is not None:
         run.claim_file("--report", report, page=True)
-    planned = [] if pool is None else [("poses", 5.0), ("pool", 5.0)]
-    run.console.expect([*planned, ("register", 30.0), *([("report", 2.0)] if report else [])])
     job = prepare(
         scene,
         photos,

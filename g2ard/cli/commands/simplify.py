@@ -107,11 +107,6 @@ def simplify(
         say_fit(run, scene, budgets[0], name)
         if source.kind != "points":
             check_whole_memory(source, tiling, WHOLE_TIMES)
-        blind = no_views or config.method == "paper" or (config.method == "fast" and views is None)
-        seen = [] if blind else [("poses", 1.0), ("visibility", 2.0)]  # seconds for playbot
-        looked = [] if blind else [("visibility", 0.5)]
-        reduced = [("simplify", 3.5), *looked, ("write", 0.1)]
-        run.console.expect([("read", 0.2), *seen, *reduced * len(budgets)])
     named = list(filter(None, (outputs, maps)))
     for each in named:
         each.check()
@@ -137,11 +132,6 @@ def simplify(
         if outputs is None:
             _tell_plan(run, reduce, [one.count for one in wanted])
             return
-        if how is not None:
-            from g2ard.jobs.cost import cost_of_reduction
-
-            costs = [cost_of_reduction(reduce, one.count) for one in wanted]
-            run.console.expect([stage for cost in costs for stage in cost.stages])
         rows = maps.paths(reduce.total) if maps else [None] * len(wanted)
         for one, place, parents in zip(wanted, outputs.paths(reduce.total), rows, strict=True):
             small = reduce(one.count)
@@ -180,18 +170,16 @@ def simplify(
 
 
 def _tell_plan(run: Run, reduce: Reduction, counts: Sequence[int]) -> None:
-    """Print the counts, and the rough time and memory of each."""
+    """Print the counts, and the rough memory of each."""
     from g2ard.jobs.cost import cost_of_reduction
 
     plans = []
     for count in counts:
         cost = cost_of_reduction(reduce, count)
-        run.answer(
-            f"{plural(count, 'Gaussian')}, weighed in {plural(cost.views, 'view')}: roughly "
-            f"{max(1, cost.seconds):.0f} s on two cores and {describe_memory(cost)}"
-        )
-        told: dict[str, Any] = {"count": count, "views": cost.views, "stages": cost.stages}
-        plans.append({**told, "bytes": cost.bytes, "seconds": cost.seconds, **count_tiles(reduce.plan)})
+        views = plural(cost.views, "view")
+        run.answer(f"{plural(count, 'Gaussian')}, weighed in {views}: roughly {describe_memory(cost)}")
+        told = {"count": count, "views": cost.views, "bytes": cost.bytes}
+        plans.append({**told, **count_tiles(reduce.plan)})
     run.say_dry()
     run.results(plans)
 
