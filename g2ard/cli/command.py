@@ -138,7 +138,7 @@ def command(
         tiles: whether it works on scenes in tiles, see `g2ard.cli.work_folder.read_tiling`.
         points: whether it takes point clouds, of which `g2ard.cli.options.choose_points` chooses points.
         outputs: parameters that are paths to write, all of which it passes to `Run.claim`.
-        without: common options that have no effect on it.
+        without: shared options that have no effect on it.
     """
 
     def register(fn: Callable[..., None]) -> Callable[..., None]:
@@ -154,10 +154,11 @@ def command(
             for path, (kind, option) in FIELDS.items()
             if path in fields
         }
-        shared_options |= {key: value for key, value in _COMMON_OPTIONS.items() if key not in without}
+        shared_options |= _COMMON_OPTIONS
         shared_options |= {} if settings is None else _SETTINGS
         shared_options |= _SCENE_OPTIONS if scenes else {}
         shared_options |= _POINT_OPTIONS if points else {}
+        unused = {key: default for key in without for default in shared_options.pop(key)[2:]}
         all_parameters = [
             *own,
             *(_create_parameter(key, *options) for key, options in shared_options.items()),
@@ -168,7 +169,7 @@ def command(
         def call(ctx: typer.Context, **values: Any) -> None:
             _prefer_flags(ctx, values, {p.name: p.default for p in all_parameters})
             shared_values = {key: values.pop(key) for key in shared_options}
-            shared_values |= {key: _COMMON_OPTIONS[key][2] for key in without}
+            shared_values |= unused
             if is_typed(ctx, "set"):  # after the config file's, since the last value wins
                 typed_last = [*(ctx.default_map or {}).get("set", []), *shared_values["set"]]
                 shared_values["set"] = typed_last

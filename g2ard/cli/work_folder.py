@@ -32,7 +32,7 @@ def read_tiling(run: Run, source: Source | None, output: Path) -> Tiling:
     from g2ard.jobs.memory import bytes_of
     from g2ard.jobs.tile_options import Tiling
 
-    tile_rows, memory, workers, scheduler, work = (run.shared[name] for name in TILES)
+    tile_rows, memory, workers, scheduler, work = (run.shared.get(name) for name in TILES)
     rows = None if tile_rows is None else int(tile_rows.value)
     if rows is not None and source is not None:
         _check_rows(source, rows)

@@ -97,10 +97,10 @@ _OTHER_KINDS: dict[tuple[Kind, Kind], str] = {
 """Hints by the expected and the found kind of a file."""
 
 MANIFEST = "tiles.json"
-"""File of finished and unfinished folders of tiles."""
+"""File of a finished folder of tiles."""
 
-POINTS = ".points"
-"""Their folder of points to lift."""
+PARTS = ".parts"
+"""Folder of the steps of an unfinished one."""
 
 _CLOUDS = (".las", ".laz", ".e57", ".pcd", ".ply")
 """Suffixes of files that a folder of clouds may hold."""
@@ -329,7 +329,7 @@ def _folder_format(path: Path) -> str:
         return name
     if (path / "tileset.json").is_file():
         return file_format(path / "tileset.json")
-    if any(path.glob("tile-*.f32")) or (path / POINTS).is_dir():
+    if any(path.glob("tile-*.f32")) or (path / PARTS).is_dir():
         raise InputError("has unfinished tiles", path=path, hint="run the same `g2ard ingest` again")
     if error := incomplete(path):
         raise error

@@ -103,6 +103,9 @@ class _Scan(PointStream):
             white = next((scale for scale in scales if scale >= stated[1]), full)
             self._range = dark, full if full == 255 or full > white else white
 
+    def __getstate__(self) -> dict[str, Any]:
+        raise TypeError("a scan cannot be searched, so that other processes would read all of it")
+
     def header_notes(self) -> Notes:
         scaled = ("eight_bit_colors", "color_range")  # fields have no range of their own
         return tuple(note for note in super().header_notes() if note.code not in scaled)

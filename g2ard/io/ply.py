@@ -90,8 +90,8 @@ class Stream(RawStream):
         self._read, self._white = self._judged()
         self.notes += self._read.notes
 
-    def positions(self, rows: int) -> Iterator[Float32]:
-        for _, block in plyfiles.row_blocks(self.path, self._rows, rows):
+    def positions(self, rows: int, start: int = 0) -> Iterator[Float32]:
+        for _, block in plyfiles.row_blocks(self.path, self._rows, rows, start):
             with np.errstate(over="ignore", invalid="ignore"):
                 means = self._means(block)
             yield self.in_axes(means)

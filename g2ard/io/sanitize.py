@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 
 import numpy as np
@@ -85,7 +85,10 @@ def cleaned(raw: Raw, notes: list[Note] | None = None, render_model: RenderModel
 
 @dataclass
 class Tally:
-    """Counts over the blocks of a file of Gaussians or points: of rows, and of values that readers change."""
+    """Counts over the blocks of a file of Gaussians or points: of rows, and of values that readers change.
+
+    Points also count as `black`, or as `bright` beyond the range of colours.
+    """
 
     item: str = "Gaussian"
     rows: int = 0
@@ -95,7 +98,17 @@ class Tally:
     logits: int = 0
     scales: int = 0
     quats: int = 0
+    black: int = 0
+    bright: int = 0
     brightest: float = -LOGIT_LIMIT
+
+    def clear(self) -> None:
+        """Forget all rows."""
+        vars(self).update(vars(Tally(self.item)))
+
+    def counts(self) -> list[float]:
+        """Return all counts, for `join`."""
+        return [getattr(self, field.name) for field in fields(self)[1:]]
 
     def _count(self, good: Mask) -> None:
         """Count rows, given an (n,) mask of those that are finite."""
@@ -113,12 +126,16 @@ class Tally:
         good &= ~noise
         return good
 
-    def join(self, other: Tally) -> None:
-        """Add the counts of another source of points, whose rows follow."""
+    def join(self, counts: Iterable[float]) -> None:
+        """Add the counts of rows that follow."""
+        *whole, brightest = counts
+        other = Tally(self.item, *map(int, whole))
+        other.brightest = brightest
         if other.dropped and not self.dropped:
             self.first = self.rows + other.first
-        for name in ("rows", "dropped", "noise"):
+        for name in ("rows", "dropped", "noise", "logits", "scales", "quats", "black", "bright"):
             setattr(self, name, getattr(self, name) + getattr(other, name))
+        self.brightest = max(self.brightest, other.brightest)
 
     def clean(self, raw: Raw) -> Mask:
         """Clamp and activate rows in place, making `log_scales` linear; return an (N,) mask to keep."""

@@ -27,7 +27,7 @@ from g2ard.io.packing import from_smallest_three
 from g2ard.io.paths import check_regular, check_unpacked, decoded, file_identity
 from g2ard.io.photo_headers import opened_image
 from g2ard.io.sanitize import BLOCK, Raw, logits_of
-from g2ard.io.stream import RawStream, from_row
+from g2ard.io.stream import RawStream, from_row, ranges
 from g2ard.io.types import Bytes, Float32, Note, Values
 from g2ard.progress import plural
 from g2ard.scene.transform import moved_axes, one_model
@@ -407,10 +407,14 @@ class Stream(RawStream):
         places = (place.iterdir() if place.is_dir() else [place] for place in chunks_of(self.path))
         return file_identity(sorted(file for files in places for file in files if file.is_file()))
 
-    def positions(self, rows: int) -> Iterator[Float32]:
+    def parts(self, rows: int) -> list[tuple[int, int]]:
+        return ranges(self._counts, rows)
+
+    def positions(self, rows: int, start: int = 0) -> Iterator[Float32]:
         with _opened(self.path) as chunks:
-            for chunk, count in zip(chunks, self._counts, strict=True):
-                yield self.in_axes(chunk.means(count))
+            for number, begin in from_row(self._counts, start):
+                means = self.in_axes(chunks[number].means(self._counts[number]))
+                yield from (means[at : at + rows] for at in range(begin, len(means), rows))
 
     def raw(self, rows: int, start: int) -> Iterator[Raw]:
         with _opened(self.path) as chunks:

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from copy import copy
 from dataclasses import replace
+from itertools import accumulate
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, Literal, NamedTuple, Self, TypeVar
 
 import numpy as np
 
@@ -42,6 +44,16 @@ _STEEP = 20.0  # extent in z over that in x and y beyond which x and y may be de
 Names = tuple[str, ...]
 
 Block = TypeVar("Block", Splats, RawPoints)
+Read = Literal["blocks", "positions"]
+
+
+class _Mapped(NamedTuple):
+    """Rows that are mapped from a file, for another process to map."""
+
+    file: Any
+    dtype: np.dtype[Any]
+    offset: int
+    shape: tuple[int, ...]
 
 
 class Stream(ABC, Generic[Block]):
@@ -54,6 +66,8 @@ class Stream(ABC, Generic[Block]):
         notes: notes on the header.
         tally: counts over the rows that `blocks` has read.
     """
+
+    _reading: tuple[tuple[Read, int], Iterator[Any]] | None = None
 
     def __init__(
         self,
@@ -69,13 +83,55 @@ class Stream(ABC, Generic[Block]):
     def __len__(self) -> int:
         return self.count
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what another process needs to read rows; it maps files that are mapped here."""
+        state = {name: value for name, value in vars(self).items() if name not in ("sample", "_reading")}
+        maps = {name: value for name, value in state.items() if isinstance(value, np.memmap)}
+        return state | {n: _Mapped(m.filename, m.dtype, m.offset, m.shape) for n, m in maps.items()}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        maps = {name: value for name, value in state.items() if isinstance(value, _Mapped)}
+        vars(self).update(state | {n: np.memmap(m.file, m.dtype, "r", *m[2:]) for n, m in maps.items()})
+
+    def absolute(self) -> Self:
+        """Return the source for a process that may run in another folder."""
+        found = copy(self)
+        found.path = self.path.absolute()
+        return found
+
     def identity(self) -> list[Any]:
         """Return JSON that identifies this source, see `file_identity`."""
         return file_identity([self.path])
 
+    def parts(self, rows: int) -> list[tuple[int, int]]:
+        """Return the first and last rows of parts, of about `rows` rows each, see `part`."""
+        return ranges([self.count], rows)
+
+    def part(self, kind: Read, rows: int, first: int, last: int) -> Iterator[Any]:
+        """Yield the `blocks` or `positions` of one of `parts(rows)`; `tallies` then count its rows.
+
+        Parts that are read one after the other are read in one pass.
+        """
+        known, self._reading = self._reading, None
+        blocks = known[1] if known and known[0] == (kind, first) else getattr(self, kind)(rows, first)
+        for tally in self.tallies():
+            tally.clear()
+        at = first
+        while at < last:
+            block = next(blocks, None)
+            if block is None:
+                raise InputError("was changed while it was read", path=self.path)
+            yield block
+            at = at + len(block) if kind == "positions" else first + sum(t.rows for t in self.tallies())
+        self._reading = ((kind, last), blocks) if last < self.count else None
+
+    def tallies(self) -> list[Tally]:
+        """Return the counts over the rows that `blocks` has read, of each of its sources."""
+        return [self.tally]
+
     @abstractmethod
-    def positions(self, rows: int) -> Iterator[Float32]:
-        """Yield the (n, 3) positions of all rows in blocks, relative to `offset`, without cleaning."""
+    def positions(self, rows: int, start: int = 0) -> Iterator[Float32]:
+        """Yield the (n, 3) positions of rows from `start` in blocks, relative to `offset`, not cleaned."""
 
     @abstractmethod
     def blocks(self, rows: int, start: int = 0) -> Iterator[Block]:
@@ -147,8 +203,8 @@ class RawStream(SceneStream):
     def raw(self, rows: int, start: int) -> Iterator[Raw]:
         """Yield the source's rows from `start`, at most `rows` at a time; callers may change the arrays."""
 
-    def positions(self, rows: int) -> Iterator[Float32]:
-        return (self.in_axes(raw.means) for raw in self.raw(rows, 0))
+    def positions(self, rows: int, start: int = 0) -> Iterator[Float32]:
+        return (self.in_axes(raw.means) for raw in self.raw(rows, start))
 
     def blocks(self, rows: int, start: int = 0) -> Iterator[Splats]:
         for raw in self.raw(rows, start):
@@ -194,16 +250,22 @@ class PartsStream(SceneStream):
             return super().whole()
         return replace(self._part(0), render_model=self.render_model, axes=self.axes)
 
-    def positions(self, rows: int) -> Iterator[Float32]:
-        return (self._part(number).means for number in range(len(self.counts)))
+    def parts(self, rows: int) -> list[tuple[int, int]]:
+        return ranges(self.counts, rows)
+
+    def positions(self, rows: int, start: int = 0) -> Iterator[Float32]:
+        return (block.means for block in self._rows(rows, start))
 
     def blocks(self, rows: int, start: int = 0) -> Iterator[Splats]:
+        for block in self._rows(rows, start):
+            self.tally.add(block)
+            yield replace(block, render_model=self.render_model, axes=self.axes)
+
+    def _rows(self, rows: int, start: int) -> Iterator[Splats]:
         for number, begin in from_row(self.counts, start):
-            part = replace(self._part(number), render_model=self.render_model, axes=self.axes)
+            part = self._part(number)
             for first in range(begin, len(part), rows):
-                block = part.take(slice(first, first + rows))
-                self.tally.add(block)
-                yield block
+                yield part.take(slice(first, first + rows))
 
     def all_notes(self) -> Notes:
         return self.notes
@@ -265,7 +327,6 @@ class PointStream(Stream[RawPoints]):
         elif self.channels == 1:
             self._range = judge.shades(values[good], limits)
             self.channels = int(self._range[0] < self._range[1])
-        self.black = self.bright = 0
 
     def shown(self, values: Float32) -> Float32:
         """Return stored values as (n, 3) colours in [0, 1]."""
@@ -274,7 +335,7 @@ class PointStream(Stream[RawPoints]):
         dark, full = self._range
         with np.errstate(invalid="ignore"):
             shades = (values - np.float32(dark)) / np.float32(full - dark)
-        self.bright += int(np.count_nonzero((shades > judge.HDR).any(axis=1)))
+        self.tally.bright += int(np.count_nonzero((shades > judge.HDR).any(axis=1)))
         return np.broadcast_to(np.clip(shades, 0, 1), (len(values), 3))
 
     @abstractmethod
@@ -294,18 +355,19 @@ class PointStream(Stream[RawPoints]):
         if self.channels == 1:
             text = f"no colours; intensities of {dark:g} to {full:g} are shown as grey"
             notes.append(Note("grey", rows, text))
-        elif self.black == rows:
+        elif self.tally.black == rows:
             text = "all colours are 0; add colours, for example with PDAL's filters.colorization"
             notes.append(Note("black", rows, text if self.channels else "no colours"))
-        elif self.black > max(_FEW_BLACK, _BLACK_SHARE * rows):
-            text = f"{plural(self.black, 'point')} are black, perhaps without colours"
-            notes.append(Note("black_points", self.black, text))
+        elif self.tally.black > max(_FEW_BLACK, _BLACK_SHARE * rows):
+            text = f"{plural(self.tally.black, 'point')} are black, perhaps without colours"
+            notes.append(Note("black_points", self.tally.black, text))
         if self.channels == 3 and 1 < full < self.scales[-1]:
             text = f"colours up to {full:,.0f} in fields of a larger range"
             notes.append(Note("eight_bit_colors" if full == 255 else "color_range", rows, text))
-        if self.channels == 3 and self.bright:
-            text = f"{plural(self.bright, 'point')} brighter than the range of most colours taken as white"
-            notes.append(Note("bright_points", self.bright, text))
+        if self.channels == 3 and self.tally.bright:
+            bright = plural(self.tally.bright, "point")
+            text = f"{bright} brighter than the range of most colours taken as white"
+            notes.append(Note("bright_points", self.tally.bright, text))
         return tuple(notes)
 
     def near(self, positions: Float) -> Float32:
@@ -313,8 +375,8 @@ class PointStream(Stream[RawPoints]):
         with np.errstate(over="ignore", invalid="ignore"):
             return (positions - self.offset).astype(np.float32)
 
-    def positions(self, rows: int) -> Iterator[Float32]:
-        for positions, _, noise in self.marked(rows, 0):
+    def positions(self, rows: int, start: int = 0) -> Iterator[Float32]:
+        for positions, _, noise in self.marked(rows, start):
             near = self.near(positions)
             near[noise] = np.nan
             yield near
@@ -324,7 +386,7 @@ class PointStream(Stream[RawPoints]):
             good = self.tally.keep(positions, values, noise)
             positions, values = (positions, values) if good.all() else (positions[good], values[good])
             colors = self.shown(values)
-            self.black += int(np.count_nonzero(colors.max(axis=1, initial=0) < _BLACK))
+            self.tally.black += int(np.count_nonzero(colors.max(axis=1, initial=0) < _BLACK))
             yield positions, colors
 
     def whole(self) -> Cloud:
@@ -385,6 +447,19 @@ class Joined(Stream[Block]):
     def identity(self) -> list[Any]:
         return [stream.identity() for stream in self.streams]
 
+    def absolute(self) -> Self:
+        found = super().absolute()
+        found.streams = [stream.absolute() for stream in self.streams]  # type: ignore[misc]
+        return found
+
+    def parts(self, rows: int) -> list[tuple[int, int]]:
+        begins = accumulate((stream.count for stream in self.streams), initial=0)
+        return [
+            (begin + first, begin + last)
+            for begin, stream in zip(begins, self.streams, strict=False)
+            for first, last in stream.parts(rows)
+        ]
+
     def header_notes(self) -> Notes:
         return tuple(replace(n, text=f"{s.path}: {n.text}") for s in self.streams for n in s.header_notes())
 
@@ -402,9 +477,10 @@ class JoinedScenes(Joined[Splats], SceneStream):
         self.up = ups.pop() if len(ups) == 1 else None
         self.axes = common_axes([stream.axes for stream in streams])
 
-    def positions(self, rows: int) -> Iterator[Float32]:
-        for stream in self.streams:
-            for means in stream.positions(rows):
+    def positions(self, rows: int, start: int = 0) -> Iterator[Float32]:
+        for number, begin in from_row([stream.count for stream in self.streams], start):
+            stream = self.streams[number]
+            for means in stream.positions(rows, begin):
                 yield self._moved(means, stream.offset)
 
     def blocks(self, rows: int, start: int = 0) -> Iterator[Splats]:
@@ -447,16 +523,25 @@ class JoinedClouds(Joined[RawPoints], PointStream):
     def header_notes(self) -> Notes:
         return (*self.notes, *super().header_notes())
 
+    def all_notes(self) -> Notes:
+        self.tally.clear()
+        for tally in self.tallies():
+            self.tally.join(tally.counts())
+        return super().all_notes()
+
+    def tallies(self) -> list[Tally]:
+        return [tally for stream in self.streams for tally in stream.tallies()]
+
     def raw(self, rows: int, start: int) -> Iterator[MarkedPoints]:
         for number, begin in from_row([stream.count for stream in self.streams], start):
             yield from self.streams[number].marked(rows, begin)
 
     def blocks(self, rows: int, start: int = 0) -> Iterator[RawPoints]:
         for number, begin in from_row([stream.count for stream in self.streams], start):
-            stream, own = self.streams[number], Tally("point")
-            stream.tally = own
+            stream = self.streams[number]
+            for tally in stream.tallies():
+                tally.clear()
             yield from stream.blocks(rows, begin)
-            self.tally.join(own)
 
 
 def joined_clouds(streams: Sequence[PointStream]) -> PointStream:
@@ -490,6 +575,20 @@ def telling(
         positions, values, noise = (np.concatenate(column) for column in zip(*read(names), strict=True))
         found.append((names, (positions, values, noise)))
     return next((each for each in found if judge.tells(each[1][1][~each[1][2]])), found[0])
+
+
+def ranges(counts: Sequence[int], rows: int) -> list[tuple[int, int]]:
+    """Return the first and last rows of ranges of at most `rows` rows that lie in one part each.
+
+    >>> ranges([5, 2], 3)
+    [(0, 3), (3, 5), (5, 7)]
+    """
+    begins = zip(accumulate(counts, initial=0), counts, strict=False)
+    return [
+        (begin + first, begin + min(first + rows, count))
+        for begin, count in begins
+        for first in range(0, count, rows)
+    ]
 
 
 def from_row(counts: Sequence[int], start: int) -> Iterator[tuple[int, int]]:

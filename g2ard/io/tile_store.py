@@ -129,8 +129,11 @@ class TileStore:
     system: str | None = None
 
     @classmethod
-    def open(cls, folder: str | Path) -> TileStore:
-        """Open the store in a folder; check the size of every file (contents are checked when read).
+    def open(cls, folder: str | Path, *, complete: bool = True) -> TileStore:
+        """Open the store in a folder.
+
+        Args:
+            complete: check the size of every file; contents are checked when they are read.
 
         Raises:
             InputError: the manifest is missing, malformed or of another version, or a file is missing or has
@@ -154,10 +157,13 @@ class TileStore:
         tiles = tuple(msgspec.structs.replace(tile, index=i) for i, tile in enumerate(manifest.tiles))
         values |= {"tiles": tiles, "offset": np.array(manifest.offset)}
         store = cls(folder, tree=tree, **values)
-        for tile in store.tiles:
-            store._check_size(tile_name(tile.index), tile.rows)
-            store._check_size(halo_name(tile.index), tile.halo)
+        for tile in store.tiles if complete else ():
+            store._check_sizes(tile)
         return store
+
+    def _check_sizes(self, tile: Tile) -> None:
+        self._check_size(tile_name(tile.index), tile.rows)
+        self._check_size(halo_name(tile.index), tile.halo)
 
     def _check_size(self, name: str, rows: int) -> None:
         path = self.folder / name
@@ -223,15 +229,18 @@ class TileStore:
             crc = zlib.crc32(rows[start : start + _ROWS_AT_ONCE].data, crc)
         self._check_contents(tile_name(index), crc, self.tiles[index].checks[0])
 
-    def check_all(self) -> None:
-        """Verify the checksums of all rows and halos.
-
-        Raises:
-            InputError: as for `read`.
-        """
+    def damaged(self, *, contents: bool) -> list[int]:
+        """Return the tiles of which a file is missing or has another size, or other `contents`."""
+        found = []
         for tile in self.tiles:
-            self.check(tile.index)
-            self.read_halo(tile.index, sh=False)
+            try:
+                self._check_sizes(tile)
+                if contents:
+                    self.check(tile.index)
+                    self.read_halo(tile.index, sh=False)
+            except InputError:
+                found.append(tile.index)
+        return found
 
     def _check_contents(self, name: str, crc: int, expected: int) -> None:
         if crc != expected:
@@ -299,3 +308,6 @@ class Stream(PartsStream):
         parts = counts, store.read, store.sh_degree, store.offset
         super().__init__(path, *parts, [store.key], store.notes, store.render_model)
         self.up, self.axes = store.up, store.axes
+
+    def absolute(self) -> Stream:
+        return Stream(self.path.absolute())

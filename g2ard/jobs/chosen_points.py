@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import astuple, dataclass
 from functools import partial
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,7 @@ from g2ard.config.schema import Settings
 from g2ard.errors import InputError, require
 from g2ard.io import Source
 from g2ard.io.sanitize import Tally
-from g2ard.io.stream import JoinedClouds, MarkedPoints, PointStream
+from g2ard.io.stream import JoinedClouds, MarkedPoints, PointStream, from_row, ranges
 from g2ard.io.types import Float32, Note, Notes, Points
 from g2ard.progress import Progress, silent
 from g2ard.scene.conditions import holds, names_in
@@ -145,16 +145,16 @@ class ChosenPoints(PointStream):
         stream.also = tuple(self._fields[name] for name in self._also)
         blocks = -(-stream.count // _ROWS)
         places, shades = [np.zeros((0, 3))], [np.zeros((0, 1), np.float32)]
-        self.count = read = 0
+        read, self._counts = 0, list[int]()
         for positions, values, noise in self._chosen():
             read = min(stream.count, read + _ROWS)
             progress("points", read, stream.count)
-            self.count += len(positions)
+            self._counts.append(len(positions))
             good = np.flatnonzero(np.isfinite(positions).all(axis=1) & ~noise)
             some = good[:: max(1, -(-len(good) * blocks // _SAMPLE))]
             places.append(positions[some])
             shades.append(values[some, :1] if self._shade else np.zeros((0, 1), np.float32))
-        self.sample = np.concatenate(places)
+        self.count, self.sample = sum(self._counts), np.concatenate(places)
         if self._shade:
             found = np.concatenate(shades)
             if len(found) and not np.ptp(found):
@@ -176,18 +176,26 @@ class ChosenPoints(PointStream):
         table[list(_CLASSES)] = list(_CLASSES.values())
         return table[np.clip(np.nan_to_num(values[:, 0]), 0, 255).astype(int)]
 
-    def raw(self, rows: int, start: int) -> Iterator[MarkedPoints]:
-        skipped = 0
-        for block in self._chosen():
-            first = min(len(block[0]), start - skipped)
-            skipped += first
-            for begin in range(first, len(block[0]), rows):
-                part = slice(begin, begin + rows)
-                yield block[0][part], block[1][part], block[2][part]
+    def absolute(self) -> Self:
+        found = super().absolute()
+        found._whole = self._whole.absolute()
+        return found
 
-    def _chosen(self) -> Iterator[MarkedPoints]:
-        """Yield the chosen points of each block of the cloud, with what colours them."""
-        for positions, values, noise in self._whole.marked(_ROWS, 0):
+    def parts(self, rows: int) -> list[tuple[int, int]]:
+        """Return the chosen points of each block of the cloud."""
+        return ranges(self._counts, _ROWS)
+
+    def raw(self, rows: int, start: int) -> Iterator[MarkedPoints]:
+        number, begin = next(from_row(self._counts, start), (len(self._counts), 0))
+        for block in self._chosen(number):
+            for first in range(begin, len(block[0]), rows):
+                part = slice(first, first + rows)
+                yield block[0][part], block[1][part], block[2][part]
+            begin = 0
+
+    def _chosen(self, block: int = 0) -> Iterator[MarkedPoints]:
+        """Yield the chosen points of each block of the cloud from one on, with what colours them."""
+        for positions, values, noise in self._whole.marked(_ROWS, block * _ROWS):
             keep = self._kept(positions, values)
             own = values.shape[1] - len(self._also)
             columns = values[:, :own]

@@ -32,6 +32,9 @@ _ROW_TIMES = 0.8
 RECOVERY_TIMES = 1.5
 """Memory of recovering or scoring a tile, renders included, relative to merging it."""
 
+WRITING_TIMES = 0.1
+"""Memory of writing a tile relative to merging it: its rows come in parts."""
+
 _LIFTING_TIMES = 1.7
 """Memory of lifting a tile's points relative to merging it: 550 bytes per point."""
 

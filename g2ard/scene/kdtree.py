@@ -164,7 +164,7 @@ class Sampler:
     """
 
     def __init__(self, count: int, size: int) -> None:
-        self._limit = min(1 << 32, max(1, (size << 32) // max(1, count)))
+        self.limit = min(1 << 32, max(1, (size << 32) // max(1, count)))
         self._most = 2 * size
         self._held = 0
         self._points: list[Points] = []
@@ -174,16 +174,16 @@ class Sampler:
         """Sample from (N, 3) float32 points, skipping points that are not finite."""
         hashes = _hashes(points)
         chosen = np.isfinite(points).all(1)
-        if self._limit < 1 << 32:
-            chosen &= hashes < np.uint32(self._limit)
+        if self.limit < 1 << 32:
+            chosen &= hashes < np.uint32(self.limit)
         self._points.append(points[chosen])
         self._hashes.append(hashes[chosen])
         self._held += len(self._points[-1])
-        while self._held > self._most and self._limit > 1:
-            self._limit //= 2
+        while self._held > self._most and self.limit > 1:
+            self.limit //= 2
             points = np.concatenate(self._points)
             hashes = np.concatenate(self._hashes)
-            stay = hashes < np.uint32(self._limit)
+            stay = hashes < np.uint32(self.limit)
             self._points = [points[stay]]
             self._hashes = [hashes[stay]]
             self._held = len(self._points[0])
@@ -191,7 +191,7 @@ class Sampler:
     def result(self) -> tuple[Points, float]:
         """Return (n, 3) points, and the number of rows per point."""
         points = np.concatenate(self._points) if self._points else np.empty((0, 3), np.float32)
-        return points, (1 << 32) / self._limit
+        return points, (1 << 32) / self.limit
 
 
 def _hashes(points: Points) -> NDArray[np.uint32]:

@@ -6,13 +6,14 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
+from shutil import rmtree
 from typing import Any
 
 from g2ard.config.checks import checks_arguments
 from g2ard.config.choices import RenderModel
 from g2ard.errors import InputError, OutputError, require
 from g2ard.io.atomic import drop_empty, drop_temporaries, parents_made
-from g2ard.io.detect import MANIFEST
+from g2ard.io.detect import MANIFEST, PARTS
 from g2ard.io.jsonfile import Place, checked, read_json
 from g2ard.io.lock import LOCK, check_unlocked, locked
 from g2ard.io.source import Source, joined
@@ -23,16 +24,13 @@ from g2ard.progress import Progress, Say, plural, silent, unsaid
 from g2ard.stages.lift import LiftConfig, guessed_axes
 from g2ard.system.keys import key_of
 from g2ard.tiles.executor import Executor, run_here
-from g2ard.tiles.writer import clear, is_tile_file, lift_tiles, pour, row_bytes
+from g2ard.tiles.writer import Pouring, clear, is_tile_file
 
 TILE_ROWS = 5_000_000
 """Default largest number of rows per tile."""
 
 MOST_TILES = 10_000
 """Approximate largest number of tiles; each is two files, and every step visits all of them."""
-
-_BLOCK_BYTES = 1 << 24
-"""Bytes of rows in memory at a time; processing makes about five copies of them."""
 
 
 @checks_arguments
@@ -43,7 +41,6 @@ def ingest(
     tile_rows: int = TILE_ROWS,
     block_rows: int | None = None,
     lift: LiftConfig | None = None,
-    like: TileStore | None = None,
     render_model: RenderModel | None = None,
     overwrite: bool = False,
     runs: Executor = run_here,
@@ -60,20 +57,19 @@ def ingest(
     Points of a point cloud are assigned in the same way and lifted tile by tile, together with the halo, so
     that points at a border have all their neighbours.
 
-    If the tiles are complete, the call returns at once. An interrupted one leaves none, but points that are
-    cut into tiles, and tiles of them that are lifted, serve the next call.
+    If the tiles are complete, the call returns at once. A call that was interrupted or killed is continued.
 
     Args:
         source: one or more scenes as accepted by `g2ard.io.read_splats`, one or more coloured point clouds as
             accepted by `g2ard.io.read_points`, or a scene stream.
         folder: output folder: absent, empty, or with these tiles.
         tile_rows: maximum Gaussians per tile; exceeded only if more of them share one position.
-        block_rows: rows in memory at a time; None means 16 MiB of rows.
+        block_rows: rows of the parts that are read one at a time; None means 32 MiB of rows.
         lift: constants for lifting points; None means `LiftConfig()`.
-        like: reuse the tree and margin of these tiles, ignoring `tile_rows`.
         render_model: overrides what the files of scenes say.
         overwrite: replace tiles of another scene or of other settings, and damaged ones.
-        runs: executor that lifts the tiles of points; by default this process.
+        runs: executor that reads parts and writes tiles; by default this process. It also reads sources that
+            only one process can: formats that are read whole, and .e57.
         progress: called with the number of rows done.
         say: called with messages.
 
@@ -98,14 +94,14 @@ def ingest(
     require("block_rows", block_rows, block_rows is None or block_rows >= 1, "at least 1")
     stream, sources = _opened(source, render_model)
     fewest = -(-stream.count // MOST_TILES)
-    if like is None and tile_rows < fewest:
+    if tile_rows < fewest:
         raise InputError(
             f"{stream.count:,} rows are too many for tiles of {tile_rows:,}; "
             f"use at least {fewest:,} rows per tile",
             path=stream.path,
             parameter="tile_rows",
         )
-    settings: dict[str, Any] = {"tile_rows": tile_rows} if like is None else {"like": like.key}
+    settings: dict[str, Any] = {"tile_rows": tile_rows}
     lift = lift or LiftConfig()
     if not isinstance(stream, SceneStream):
         settings["lift"] = asdict(lift)
@@ -113,34 +109,44 @@ def ingest(
         settings["render_model"] = stream.render_model
     decisive = {"version": VERSION, "source": stream.identity(), **settings}
     key = key_of(decisive)
-    done = _done(folder, key, overwrite)
-    if done is not None:
+    store, damaged = _examine(folder, key, overwrite)
+    if store is not None and not damaged:
         with suppress(OutputError):  # another call may be about to end
             check_unlocked(folder)  # removes the lock of a killed one
             drop_temporaries(folder, MANIFEST)
-        say(f"{folder}: already holds these {plural(done.count, 'Gaussian')}; skipped")
-        return done
+            rmtree(folder / PARTS, ignore_errors=True)
+        say(f"{folder}: already holds these {plural(store.count, 'Gaussian')}; skipped")
+        return store
     made = _made(folder)
     try:
         with locked(folder):
-            _check_tiles(folder, key, settings, overwrite, say)
-            clear(folder, key)
+            if store is None:
+                _check_tiles(folder, key, settings, overwrite, say)
+                clear(folder, key)
+            else:
+                say(f"{folder}: {plural(len(damaged), 'tile')} damaged; writing again")
             try:
-                rows = block_rows or max(1, _BLOCK_BYTES // row_bytes(stream))
-                if isinstance(stream, SceneStream):
-                    writer = pour(folder, stream, tile_rows, rows, progress, say, like)
-                    notes = [*stream.all_notes()]
-                else:
-                    how = tile_rows, rows, progress, say, runs
-                    writer, found = lift_tiles(folder, stream, lift, key, *how)
-                    notes = [*found]
-                if not like and (over := sum(count > tile_rows for count in writer.counts)):
-                    tiles = plural(over, "tile")
-                    text = f"{tiles} of more than {tile_rows:,} Gaussians: many share one position"
-                    notes.append(Note("overfull_tiles", over, text))
-                writer.finish(key, _manifest(stream, sources, settings, notes, progress))
+                pouring = Pouring(
+                    *(folder, stream, key),
+                    tile_rows=tile_rows,
+                    rows=block_rows,
+                    runs=runs,
+                    mended=None if store is None else (store, damaged),
+                    progress=progress,
+                    say=say,
+                )
+                tree, files = pouring.cut()
+                notes = [*stream.all_notes()]
+                if not isinstance(stream, SceneStream):
+                    files = pouring.lift(tree, files, lift)
+                tiles = pouring.gather(tree, files)
+                if over := sum(tile["rows"] > tile_rows for tile in tiles):
+                    text = f"of more than {tile_rows:,} Gaussians: many share one position"
+                    notes.append(Note("overfull_tiles", over, f"{plural(over, 'tile')} {text}"))
+                pouring.finish(tree, tiles, _manifest(stream, sources, settings, notes, progress))
             except BaseException as error:
-                clear(folder, key if isinstance(error, KeyboardInterrupt) else None)
+                kept = key if isinstance(error, KeyboardInterrupt) else None
+                clear(folder, kept, complete=store is not None)
                 raise
     finally:
         drop_empty(made)
@@ -181,22 +187,21 @@ def _opened(
     return joined(sources), [str(one) for each in sources for one in (each, *each.others)]
 
 
-def _done(folder: Path, key: str, overwrite: bool) -> TileStore | None:
-    """Return the store if it is complete and has this key, otherwise None; `overwrite` checks its contents.
+def _examine(folder: Path, key: str, overwrite: bool) -> tuple[TileStore | None, list[int]]:
+    """Return the store that has this key, if there is one, and its damaged tiles.
 
-    A broken manifest raises, unless it has this key or `overwrite` is set.
+    `overwrite` checks contents. A broken manifest raises, unless it has this key or `overwrite` is set.
     """
-    if not (folder / MANIFEST).is_file():
-        return None
+    manifest = folder / MANIFEST
+    if not manifest.is_file() or ((known := _key_in(manifest)) != key and overwrite):
+        return None, []
     try:
-        store = TileStore.open(folder)
-        if overwrite:
-            store.check_all()
+        store = TileStore.open(folder, complete=known != key)
     except InputError:
-        if overwrite or _key_in(folder / MANIFEST) == key:
-            return None
+        if known == key:
+            return None, []
         raise
-    return store if store.key == key else None
+    return (store, store.damaged(contents=overwrite)) if known == key else (None, [])
 
 
 def _made(folder: Path) -> list[Path]:
@@ -226,7 +231,7 @@ def _check_tiles(folder: Path, key: str, settings: dict[str, Any], overwrite: bo
             hint="{overwrite=True} replaces it",
         )
     if known == key:
-        say(f"{folder}: its tiles are damaged; writing them again")
+        say(f"{folder}: {MANIFEST} is damaged; writing all tiles again")
 
 
 def _differing(manifest: Path, settings: dict[str, Any]) -> str:

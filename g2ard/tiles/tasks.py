@@ -32,7 +32,7 @@ Arrays = dict[str, NDArray[Any]]
 
 Arguments = Mapping[str, Any]
 Inputs = Mapping[str, Any]
-Places = Mapping[str, Path]
+Places = Mapping[str, Any]
 """Parameters of a task's function, see `Task`."""
 
 _SCENE_ARRAYS = ("means", "quats", "scales", "logit_opacities", "sh0", "shN", "offset", "render_model")
@@ -66,7 +66,7 @@ class Task:
         function: "module:name" of a function (arguments, inputs, places) → arrays.
         arguments: JSON values.
         inputs: output files of other tasks, by name.
-        places: files and folders whose content `arguments` determine; they may be moved.
+        places: files, folders and streams whose content `arguments` determine; they may be moved.
         cost: amount of work in any common unit, for progress.
     """
 
@@ -75,7 +75,7 @@ class Task:
     folder: Path = field(metadata=UNKEYED)
     arguments: Mapping[str, Any] = field(default_factory=dict)
     inputs: Mapping[str, Path | list[Path]] = field(default_factory=dict)
-    places: Mapping[str, Path] = field(default_factory=dict, metadata=UNKEYED)
+    places: Places = field(default_factory=dict, metadata=UNKEYED)
     cost: int = field(default=1, metadata=UNKEYED)
 
     def absolute(self) -> Task:

@@ -1,31 +1,38 @@
-"""Writing rows of scenes and point clouds to tile files."""
+"""Writing scenes and point clouds as tiles.
+
+Parts of the rows are sampled, which gives the tree of tiles, and cut along it. Points are then lifted tile by
+tile. Finally, the rows of each tile are gathered. Every step is a task, so that a killed call is continued.
+"""
+
+from __future__ import annotations
 
 import json
+import os
+import pickle
 import re
 import shutil
 import zlib
-from collections.abc import Iterator
-from contextlib import suppress
-from dataclasses import asdict, dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from g2ard.errors import InputError, OutputError
+from g2ard.errors import OutputError
 from g2ard.io.atomic import atomic_output, drop_temporaries
-from g2ard.io.detect import MANIFEST, POINTS
+from g2ard.io.detect import MANIFEST, PARTS
 from g2ard.io.jsonfile import read_json
-from g2ard.io.sanitize import Tally
 from g2ard.io.stream import PointStream, SceneStream
 from g2ard.io.tile_store import FORMAT, VERSION, TileStore, halo_name, packed, row_width, tile_name
-from g2ard.io.types import Note, Notes
 from g2ard.progress import Progress, Say, plural
 from g2ard.scene.kdtree import KdTree, Points, Sampler, cut_tree, margin_of, parts_of
 from g2ard.stages.lift import LiftConfig, lift_rows
-from g2ard.tiles.executor import Executor, Workers
-from g2ard.tiles.tasks import Arguments, Arrays, Inputs, Places, Task, load, telling
+from g2ard.system.cached import cached_property
+from g2ard.system.keys import key_of
+from g2ard.tiles.executor import Executor, Workers, run_here
+from g2ard.tiles.tasks import Arguments, Arrays, Inputs, Places, Task, is_whole, load, save, telling
 
 _TREE_SAMPLE = 1 << 20
 """Size of the sample of positions that determines the tiles (12 MB)."""
@@ -33,9 +40,15 @@ _TREE_SAMPLE = 1 << 20
 _POINT_DTYPE = np.dtype([("near", "<f4", 3), ("rgb", "<f4", 3), ("far", "<f8", 3)])
 """A point: float32 position relative to the offset (determines the tile), stored colour, world position."""
 
-_ROWS_AT_ONCE = 1 << 16
-"""Rows of a lifted tile written at a time."""
-_TILE_FILE = re.compile(r"(tile|halo)-\d{5,}\.f32|tiles\.json|\.tiles\.[0-9a-f]{12}\.json|\.points")
+_PART_BYTES = 1 << 25
+"""Bytes of rows of a part; a task makes about four copies of them."""
+
+_SENT_BYTES = 1 << 22
+"""Largest stream that is sent to workers, with each part: others are read by this process."""
+
+_TILE_FILE = re.compile(r"(tile|halo)-\d{5,}\.f32|tiles\.json|\.tiles\.[0-9a-f]{12}\.json|\.parts")
+
+Stream = SceneStream | PointStream
 
 
 def is_tile_file(name: str) -> bool:
@@ -49,274 +62,399 @@ def expected_tiles(count: int, tile_rows: int) -> int:
     return parts_of(points, count / points, tile_rows)
 
 
-def clear(folder: Path, key: str | None = None) -> None:
-    """Remove all files that belong to tiles, the manifest first, but keep the points of those with a key."""
+def clear(folder: Path, key: str | None = None, *, complete: bool = False) -> None:
+    """Remove all files of tiles, the manifest first, but of unfinished ones with a key only that.
+
+    Args:
+        complete: whether the folder has all tiles, so that only unfinished steps are removed.
+    """
     drop_temporaries(folder, MANIFEST)
-    for path in sorted(folder.iterdir(), key=lambda path: path.name != MANIFEST):
-        if path.is_dir() and path.name == POINTS:
-            if key is None or not is_poured(path, key):
-                shutil.rmtree(path)
-        elif is_tile_file(path.name):
+    if not complete:
+        (folder / MANIFEST).unlink(missing_ok=True)
+    parts = folder / PARTS
+    if key is not None and _read_begun(parts).get("key") == key and any(parts.glob("*.npz")):
+        return
+    shutil.rmtree(parts, ignore_errors=True)
+    for path in sorted(folder.iterdir()) if not complete else ():
+        if is_tile_file(path.name):
             path.unlink()
 
 
-def row_bytes(stream: SceneStream | PointStream) -> int:
+def _read_begun(parts: Path) -> dict[str, Any]:
+    """Return what is known of begun tiles: their key, and the file of their tree."""
+    return dict(read_json(parts / MANIFEST)) if (parts / MANIFEST).is_file() else {}
+
+
+class Pouring:
+    """The tiles of a stream while they are written; the manifest comes last.
+
+    Args:
+        key: of the tiles.
+        tile_rows: most rows of a tile.
+        rows: rows of a part; None means 32 MiB of rows.
+        runs: executor of the steps.
+        mended: complete tiles, and those of them to write again; None writes all.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        stream: Stream,
+        key: str,
+        *,
+        tile_rows: int,
+        rows: int | None,
+        runs: Executor,
+        mended: tuple[TileStore, list[int]] | None,
+        progress: Progress,
+        say: Say,
+    ) -> None:
+        self.folder = folder
+        self.parts = folder / PARTS
+        self.stream = stream
+        self.key = key
+        self.tile_rows = tile_rows
+        self.mended = mended
+        self.say = say
+        self.rows = rows or max(1, _PART_BYTES // row_bytes(stream))
+        self.parts.mkdir(exist_ok=True)
+        self.workers = Workers(runs, self.parts, progress)
+        here = runs is run_here or not _can_be_sent(stream)
+        self.readers = replace(self.workers, executor=run_here) if here else self.workers
+        if _read_begun(self.parts).get("key") != key:
+            self._begin({"key": key})
+
+    def _begin(self, known: dict[str, Any]) -> None:
+        with atomic_output(self.parts / MANIFEST, overwrite=True) as temporary:
+            temporary.write_text(json.dumps(known), encoding="ascii")
+
+    def cut(self) -> tuple[Path, list[Path]]:
+        """Cut the parts into tiles; return the files of the tree and of the parts."""
+        known = _read_begun(self.parts).get("tree")
+        tree = self.parts / known if known else None
+        if tree is None or not is_whole(tree):
+            tree = self._plan()
+        while True:
+            files = self._run_parts("cut", "tiles", {"only": self._near}, {"tree": tree})
+            self._tell_counts(files)
+            parts = self._cut_again(files)
+            if not parts:
+                return tree, files
+            self.say(f"{plural(len(parts), 'tile')} hold more than {self.tile_rows:,} rows; cutting again")
+            refined = _load_tree(tree)[0].refined(parts)
+            tree = self._save_tree(refined, margin_of(refined, self._sample()[0]))
+            for path in files:
+                path.unlink()
+
+    def _run_parts(
+        self, function: str, stage: str, arguments: dict[str, Any], inputs: dict[str, Path]
+    ) -> list[Path]:
+        """Run a function that reads the stream on each part."""
+        tasks = [
+            Task(
+                f"{__name__}:{function}",
+                f"{function}-{number:05}",
+                self.parts,
+                {"key": self.key, "part": [self.rows, first, last], **arguments},
+                inputs,
+                {"stream": self.stream},
+                last - first,
+            )
+            for number, (first, last) in enumerate(self.stream.parts(self.rows))
+        ]
+        return self.readers.run(tasks, stage)
+
+    @cached_property
+    def _near(self) -> list[int] | None:
+        """The tiles to write, and those that have rows of their halos; None for all."""
+        if self.mended is None:
+            return None
+        store, tiles = self.mended
+        low, high = store.tree.boxes().swapaxes(0, 1)
+        gaps = [np.maximum(low - high[tile], low[tile] - high).max(axis=1) for tile in tiles]
+        return np.flatnonzero(np.min(gaps, axis=0) <= store.margin).tolist()
+
+    def _plan(self) -> Path:
+        """Plan the tiles; check that the disk has room."""
+        if self.mended is not None:
+            return self._save_tree(self.mended[0].tree, self.mended[0].margin)
+        points, each = np.empty((0, 3), np.float32), 1.0
+        if self.stream.count > self.tile_rows:
+            points, each = self._sample()
+        tree = cut_tree(points, each, self.tile_rows)
+        margin = margin_of(tree, points)
+        around = each * sum(len(halo) for _, halo in tree.route(points, margin))
+        written = [row_bytes(self.stream)]  # in parts, as lifted, and in tiles
+        written += [4 * row_width(0)] * 2 if isinstance(self.stream, PointStream) else written
+        needed = int((self.stream.count + around) * sum(written))
+        free = shutil.disk_usage(self.folder).free
+        if needed > free:
+            raise OutputError(
+                f"the tiles need {needed / 1e9:,.1f} GB, the disk has {free / 1e9:,.1f} GB free",
+                path=self.folder,
+            )
+        return self._save_tree(tree, margin)
+
+    def _sample(self) -> tuple[Points, float]:
+        """Return a sample of positions, and the rows that each stands for."""
+        files = self._run_parts("sample", "sample", {"count": self.stream.count, "size": _TREE_SAMPLE}, {})
+        sampler = Sampler(self.stream.count, _TREE_SAMPLE)
+        sampler.limit = min([sampler.limit, *(int(load(path, "limit")[0]) for path in files)])
+        for path in files:
+            sampler.add(load(path, "points")[0])
+        return sampler.result()
+
+    def _save_tree(self, tree: KdTree, margin: float) -> Path:
+        """Write a tree for tasks, and remember it for calls that continue."""
+        cells = json.dumps(tree.to_json())
+        path = self.parts / f"tree-{key_of([cells, margin])}.npz"
+        save(path, {"cells": np.array(cells), "margin": np.array(margin)})
+        self._begin({"key": self.key, "tree": path.name})
+        return path
+
+    def _tell_counts(self, files: Sequence[Path]) -> None:
+        """Count the rows of all parts in the stream, which raises an `InputError` if none is finite."""
+        tallies = self.stream.tallies()
+        for tally in tallies:
+            tally.clear()
+        for path in files:
+            for tally, counts in zip(tallies, load(path, "tallies")[0], strict=True):
+                tally.join(counts)
+        self.stream.all_notes()
+
+    def _cut_again(self, files: Sequence[Path]) -> dict[int, KdTree]:
+        """Plan cuts of the tiles that exceed `tile_rows`."""
+        parts = {}
+        counts = _count_rows(files)[..., 0]
+        for tile in np.flatnonzero(counts.sum(axis=0) > self.tile_rows).tolist():
+            rows = _load_rows(_select(files, counts[:, tile]), tile_name(tile))
+            tree = cut_tree(_get_positions(rows), 1.0, self.tile_rows)
+            if tree.leaves > 1:
+                parts[tile] = tree
+        return parts
+
+    def lift(self, tree: Path, files: Sequence[Path], config: LiftConfig) -> list[Path]:
+        """Lift the points of each tile with its halo; return the files of the tiles."""
+        arguments = {"config": asdict(config), "only": self._near}
+        return self._run_each("lifted", "lift", self._near, files, arguments, {"tree": tree}, {})
+
+    def _run_each(
+        self,
+        function: str,
+        stage: str,
+        tiles: list[int] | None,
+        files: Sequence[Path],
+        arguments: dict[str, Any],
+        inputs: dict[str, Any],
+        places: dict[str, Path],
+    ) -> list[Path]:
+        """Run a function for tiles, None for all; it gets the files that have rows of a tile or its halo."""
+        counts = _count_rows(files)
+        tasks = [
+            Task(
+                f"{__name__}:{function}",
+                f"{function}-{tile:05}",
+                self.parts,
+                {"key": self.key, "tile": tile, **arguments},
+                {
+                    "core": _select(files, counts[:, tile, 0]),
+                    "halo": _select(files, counts[:, tile, 1]),
+                    **inputs,
+                },
+                places,
+                int(counts[:, tile, 0].sum()),
+            )
+            for tile in (range(counts.shape[1]) if tiles is None else tiles)
+        ]
+        return self.workers.run(tasks, stage)
+
+    def gather(self, tree: Path, files: Sequence[Path]) -> list[dict[str, Any]]:
+        """Write the rows of each tile and of its halo; return the manifest's entries."""
+        some = None if self.mended is None else self.mended[1]
+        written = self._run_each("gathered", "write", some, files, {}, {}, {"folder": self.folder})
+        bounds = np.array([load(path, "bounds")[0] for path in written])
+        low, high = bounds[:, 0].min(axis=0), bounds[:, 1].max(axis=0)
+        boxes = _load_tree(tree)[0].boxes()
+        tiles = []
+        for path, box in zip(written, boxes if some is None else boxes[some], strict=True):
+            (rows, halo), checks = (array.tolist() for array in load(path, "rows", "checks"))
+            corners = np.clip(box, low, high).tolist()
+            tiles.append({"rows": rows, "halo": halo, "low": corners[0], "high": corners[1], "crc32": checks})
+        return tiles
+
+    def finish(self, tree: Path, tiles: list[dict[str, Any]], manifest: dict[str, Any]) -> None:
+        """Write the manifest, which makes the folder a store, and drop the steps."""
+        cells, margin = _load_tree(tree)
+        content = {
+            "format": FORMAT,
+            "version": VERSION,
+            "key": self.key,
+            "count": sum(tile["rows"] for tile in tiles),
+            **manifest,
+            "margin": margin,
+            "cells": cells.to_json(),
+            "tiles": tiles,
+        }
+        if self.mended is not None:
+            content = dict(read_json(self.folder / MANIFEST))
+            for index, tile in zip(self.mended[1], tiles, strict=True):
+                content["tiles"][index]["crc32"] = tile["crc32"]
+        with atomic_output(self.folder / MANIFEST, overwrite=True) as temporary:
+            temporary.write_text(json.dumps(content) + "\n", encoding="utf-8", newline="\n")
+        shutil.rmtree(self.parts)
+
+
+def row_bytes(stream: Stream) -> int:
     """Return the bytes of a Gaussian or of a point to be lifted, which begin with its float32 position."""
     return 4 * row_width(stream.sh_degree) if isinstance(stream, SceneStream) else _POINT_DTYPE.itemsize
 
 
-def _rows(stream: SceneStream | PointStream, rows: int) -> Iterator[tuple[NDArray[Any], Points]]:
-    """Yield the rows to keep with their positions, reading `rows` at a time."""
-    if isinstance(stream, SceneStream):
-        yield from ((packed(splats), splats.means) for splats in stream.blocks(rows))
-        return
-    for far, colors in stream.blocks(rows):
-        block = np.empty(len(far), _POINT_DTYPE)
-        block["near"], block["rgb"], block["far"] = stream.near(far), colors, far
-        yield block, np.ascontiguousarray(block["near"])
+def _can_be_sent(stream: Stream) -> bool:
+    """Return whether workers can read a stream: it is small, and can be read from any row."""
+    try:
+        pickle.dump(stream, _Small())
+    except (TypeError, AttributeError, OverflowError, pickle.PicklingError):
+        return False
+    return True
 
 
-@dataclass
-class TileWriter:
-    """The tiles of a scene while they are written; the manifest comes last.
+class _Small:
+    """A file that takes few bytes and keeps none."""
 
-    Args:
-        row_bytes: bytes per row.
-    """
+    size = 0
 
-    folder: Path
-    tree: KdTree
-    margin: float
-    row_bytes: int
-    low: list[float] = field(default_factory=lambda: [np.inf] * 3)
-    high: list[float] = field(default_factory=lambda: [-np.inf] * 3)
-
-    def __post_init__(self) -> None:
-        self.rows: dict[str, int] = {}  # file → rows written
-        self.checks: dict[str, int] = {}
-        for index in range(self.tree.leaves):
-            for name in (tile_name(index), halo_name(index)):
-                (self.folder / name).write_bytes(b"")
-                self.rows[name] = self.checks[name] = 0
-
-    @property
-    def counts(self) -> list[int]:
-        """Rows of each tile."""
-        return [self.rows[tile_name(index)] for index in range(self.tree.leaves)]
-
-    def positions(self, name: str, count: int) -> Points:
-        """Return the (count, 3) float32 positions in a file, the first three numbers of each row."""
-        rows = np.memmap(self.folder / name, "u1", "r", shape=(count, self.row_bytes))
-        return np.ascontiguousarray(rows[:, :12]).view("<f4")
-
-    def add(self, rows: NDArray[Any], means: Points) -> None:
-        """Append rows to their tiles and to the halos of tiles nearby."""
-        if not len(rows):
-            return
-        self.low = np.minimum(self.low, means.min(axis=0).astype(np.float64)).tolist()
-        self.high = np.maximum(self.high, means.max(axis=0).astype(np.float64)).tolist()
-        for index, (core, halo) in enumerate(self.tree.route(means, self.margin)):
-            self._append(tile_name(index), rows, core)
-            self._append(halo_name(index), rows, halo)
-
-    def _append(self, name: str, rows: NDArray[Any], chosen: NDArray[np.intp]) -> None:
-        if not len(chosen):
-            return
-        data = (rows if len(chosen) == len(rows) else rows[chosen]).view(np.uint8).data
-        try:
-            with (self.folder / name).open("ab") as file:
-                file.write(data)
-        except OSError as error:
-            raise OutputError(f"cannot write: {error.strerror or error}", path=self.folder / name) from error
-        self.rows[name] += len(chosen)
-        self.checks[name] = zlib.crc32(data, self.checks[name])
-
-    def finish(self, key: str, manifest: dict[str, Any]) -> None:
-        """Write the manifest, which makes the folder a store."""
-        low, high = np.array(self.low), np.array(self.high)
-        tiles = [
-            {
-                "rows": self.rows[tile_name(i)],
-                "halo": self.rows[halo_name(i)],
-                "low": np.clip(box[0], low, high).tolist(),
-                "high": np.clip(box[1], low, high).tolist(),
-                "crc32": [self.checks[tile_name(i)], self.checks[halo_name(i)]],
-            }
-            for i, box in enumerate(self.tree.boxes())
-        ]
-        content = {
-            "format": FORMAT,
-            "version": VERSION,
-            "key": key,
-            "count": sum(self.counts),
-            **manifest,
-            "margin": self.margin,
-            "cells": self.tree.to_json(),
-            "tiles": tiles,
-        }
-        _write_json(self.folder / MANIFEST, content)
+    def write(self, data: Any) -> None:
+        self.size += memoryview(data).nbytes
+        if self.size > _SENT_BYTES:
+            raise OverflowError
 
 
-def _write_json(path: Path, content: dict[str, Any]) -> None:
-    with atomic_output(path, overwrite=True) as temporary:
-        temporary.write_text(json.dumps(content) + "\n", encoding="utf-8", newline="\n")
+def _load_tree(path: Path) -> tuple[KdTree, float]:
+    cells, margin = load(path, "cells", "margin")
+    return KdTree.from_json(json.loads(str(cells))), float(margin)
 
 
-def pour(
-    folder: Path,
-    stream: SceneStream | PointStream,
-    tile_rows: int,
-    rows: int,
-    progress: Progress,
-    say: Say,
-    like: TileStore | None = None,
-) -> TileWriter:
-    """Write all tiles and halos of a stream into an existing folder.
+def _count_rows(files: Sequence[Path]) -> NDArray[np.int64]:
+    """Return the (files, tiles, 2) numbers of rows of each tile, and of its halo, in each file."""
+    return np.array([load(path, "counts")[0] for path in files])
+
+
+def _select(files: Sequence[Path], counts: NDArray[np.int64]) -> list[Path]:
+    return [path for path, count in zip(files, counts, strict=True) if count]
+
+
+def _get_positions(rows: NDArray[Any]) -> Points:
+    """Return the (n, 3) float32 positions with which rows begin."""
+    return np.ascontiguousarray(rows["near"] if rows.dtype.names else rows[:, :3])
+
+
+def _load_rows(files: Sequence[Path], name: str) -> NDArray[Any]:
+    return np.concatenate([load(path, name)[0] for path in files])
+
+
+def sample(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
+    """Sample the positions of a part.
 
     Args:
-        rows: rows in memory at a time.
-        like: reuse the tree and margin of these tiles, ignoring `tile_rows`.
-    """
-    tree, margin = _planned(folder, stream, tile_rows, rows, progress, like)
-    while True:
-        writer = TileWriter(folder, tree, margin, row_bytes(stream))
-        stream.tally = Tally(stream.tally.item)
-        for block, positions in _rows(stream, rows):
-            writer.add(block, positions)
-            progress("tiles", stream.tally.rows, stream.count)
-        stream.all_notes()
-        parts = {} if like else _overfull(writer, tile_rows)
-        if not parts:
-            return writer
-        say(f"{plural(len(parts), 'tile')} hold more than {tile_rows:,} rows; cutting again")
-        tree = writer.tree.refined(parts)
-        margin = margin_of(tree, _sampled(stream, rows, progress)[0])
-
-
-def _planned(
-    folder: Path,
-    stream: SceneStream | PointStream,
-    tile_rows: int,
-    rows: int,
-    progress: Progress,
-    like: TileStore | None,
-) -> tuple[KdTree, float]:
-    """Return the tree of tiles and their margin; check that the disk has room."""
-    tree, points, each = like.tree if like else KdTree(), np.empty((0, 3), np.float32), 1.0
-    if like or stream.count > tile_rows:
-        points, each = _sampled(stream, rows, progress)
-    if not like:
-        tree = cut_tree(points, each, tile_rows)
-    margin = like.margin if like else margin_of(tree, points)
-    around = each * sum(len(halo) for _, halo in tree.route(points, margin))
-    discs = 0 if isinstance(stream, SceneStream) else 2 * 4 * row_width(0)
-    room = row_bytes(stream) + discs  # of a row on the disk, including all copies
-    needed, free = int((stream.count + around) * room), shutil.disk_usage(folder).free
-    if needed > free:
-        raise OutputError(
-            f"the tiles need {needed / 1e9:,.1f} GB, the disk has {free / 1e9:,.1f} GB free", path=folder
-        )
-    return tree, margin
-
-
-def _sampled(stream: SceneStream | PointStream, rows: int, progress: Progress) -> tuple[Points, float]:
-    sampler, done = Sampler(stream.count, _TREE_SAMPLE), 0
-    for points in stream.positions(rows):
-        sampler.add(points)
-        done += len(points)
-        progress("sample", done, stream.count)
-    return sampler.result()
-
-
-def _overfull(writer: TileWriter, tile_rows: int) -> dict[int, KdTree]:
-    """Plan cuts of the tiles that exceed `tile_rows`."""
-    parts = {}
-    for index, count in enumerate(writer.counts):
-        if count > tile_rows:
-            tree = cut_tree(writer.positions(tile_name(index), count), 1.0, tile_rows)
-            if tree.leaves > 1:
-                parts[index] = tree
-    return parts
-
-
-def lift_tiles(
-    folder: Path,
-    cloud: PointStream,
-    config: LiftConfig,
-    key: str,
-    tile_rows: int,
-    rows: int,
-    progress: Progress,
-    say: Say,
-    runs: Executor,
-) -> tuple[TileWriter, Notes]:
-    """Write points to tiles in a subfolder, then lift each tile with its halo and write the result.
-
-    Points that are all in tiles, and tiles that are lifted, stay for the next call if this one ends before.
-
-    Args:
-        key: of the tiles.
-        runs: lifts the tiles.
-
-    Others are those of `pour`.
+        arguments: `part`, see `Stream.part`; `count` and `size`, of the `Sampler`.
+        places: `stream`.
 
     Returns:
-        The tiles, and notes on the cloud.
+        `points`, (n, 3), and the `limit` of their hashes.
     """
-    within = folder / POINTS
-    within.mkdir(exist_ok=True)
-    if not is_poured(within, key):
-        points = pour(within, cloud, tile_rows, rows, progress, say)
-        notes = [asdict(note) for note in cloud.all_notes()]
-        tree = {"cells": points.tree.to_json(), "margin": points.margin, "counts": points.counts}
-        _write_json(within / MANIFEST, {"key": key, "notes": notes, **tree})
-    poured = read_json(within / MANIFEST)
-    given = {"key": key, "config": asdict(config), "offset": cloud.offset.tolist()}
-    tasks = [
-        Task(
-            f"{__name__}:lifted",
-            f"lifted-{tile:05}",
-            within,
-            {**given, "tile": tile},
-            places={"points": within},
-            cost=count,
-        )
-        for tile, count in enumerate(poured["counts"])
-    ]
-    files = Workers(runs, within, progress).run(tasks, "lift")
-    writer = TileWriter(folder, KdTree.from_json(poured["cells"]), poured["margin"], 4 * row_width(0))
-    for path in files:
-        (discs,) = load(path, "rows")
-        for start in range(0, len(discs), _ROWS_AT_ONCE):
-            part = discs[start : start + _ROWS_AT_ONCE]
-            writer.add(part, np.ascontiguousarray(part[:, :3]))
-    shutil.rmtree(within)
-    return writer, tuple(Note(**note) for note in poured["notes"])
+    sampler = Sampler(arguments["count"], arguments["size"])
+    for points in places["stream"].part("positions", *arguments["part"]):
+        sampler.add(points)
+    return {"points": sampler.result()[0], "limit": np.array(sampler.limit)}
 
 
-def is_poured(points: Path, key: str) -> bool:
-    """Return whether a folder has all points of the tiles with this key."""
-    with suppress(InputError, LookupError, TypeError):
-        return bool(read_json(points / MANIFEST)["key"] == key)
-    return False
+def cut(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
+    """Cut a part into tiles.
+
+    Args:
+        arguments: `part`, see `Stream.part`; `only`, the tiles to cut, None for all.
+        inputs: `tree`.
+        places: `stream`.
+
+    Returns:
+        What `_route` returns; `tallies`, the counts of each source.
+    """
+    stream, blocks = places["stream"], list[NDArray[Any]]()
+    for block in stream.part("blocks", *arguments["part"]):
+        if isinstance(stream, PointStream):
+            far, colors = block
+            points = np.empty(len(far), _POINT_DTYPE)
+            points["near"], points["rgb"], points["far"] = stream.near(far), colors, far
+            blocks.append(points)
+        else:
+            blocks.append(packed(block))
+    rows = blocks[0] if len(blocks) == 1 else np.concatenate(blocks)
+    tallies = np.array([tally.counts() for tally in stream.tallies()])
+    return {**_route(rows, inputs["tree"], arguments["only"]), "tallies": tallies}
+
+
+def _route(rows: NDArray[Any], file: Path, only: Sequence[int] | None) -> Arrays:
+    """Return the rows of each tile and of its halo, called by the names of its files, if there are any.
+
+    `counts`, (tiles, 2), has their numbers.
+    """
+    tree, margin = _load_tree(file)
+    made, counts = Arrays(), np.zeros((tree.leaves, 2), np.int64)
+    for tile, chosen in enumerate(tree.route(_get_positions(rows), margin)):
+        if only is not None and tile not in only:
+            continue
+        counts[tile] = [len(some) for some in chosen]
+        for name, some in zip((tile_name(tile), halo_name(tile)), chosen, strict=True):
+            if len(some):
+                made[name] = rows if len(some) == len(rows) else rows[some]
+    return {**made, "counts": counts}
 
 
 def lifted(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
     """Lift a tile's points with those of its halo as neighbours.
 
     Args:
-        arguments: `tile`; `config`, the fields of `LiftConfig`; `offset`, that of the tiles.
-        places: `points`, the folder of their tiles.
+        arguments: `tile`; `config`, the fields of `LiftConfig`; `only`, see `cut`.
+        inputs: `core`, `halo`, the files of `cut` that have points of the tile and of its halo; `tree`.
 
     Returns:
-        `rows`, as tiles have them.
+        What `_route` returns of the discs.
     """
-    names = tile_name(arguments["tile"]), halo_name(arguments["tile"])
-    core, halo = (np.fromfile(places["points"] / name, _POINT_DTYPE) for name in names)
-    if not len(core):
-        return {"rows": np.empty((0, row_width(0)), "<f4")}
-    both = np.concatenate([core, halo])
+    if not inputs["core"]:
+        return _route(np.empty((0, row_width(0)), "<f4"), inputs["tree"], arguments["only"])
+    core = _load_rows(inputs["core"], tile_name(arguments["tile"]))
+    halo = [load(path, halo_name(arguments["tile"]))[0] for path in inputs["halo"]]
+    both = np.concatenate([core, *halo])
     discs, rows = lift_rows(both["far"], both["rgb"], LiftConfig(**arguments["config"]), telling)
     rows = rows[rows < len(core)]
     means = np.ascontiguousarray(core["near"][rows])
-    return {"rows": packed(replace(discs.take(slice(0, len(rows))), means=means))}
+    kept = replace(discs.take(slice(0, len(rows))), means=means)
+    return _route(packed(kept), inputs["tree"], arguments["only"])
+
+
+def gathered(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
+    """Write the files of a tile.
+
+    Args:
+        arguments: `tile`.
+        inputs: `core`, `halo`, the files that have rows of the tile and of its halo, in their order.
+        places: `folder`, of the tiles.
+
+    Returns:
+        `rows` and `checks` (CRC-32) of both files; `bounds`, (2, 3) of the tile's positions.
+    """
+    tile, folder = arguments["tile"], places["folder"]
+    counts, checks = [0, 0], [0, 0]
+    low, high = np.full(3, np.inf), np.full(3, -np.inf)
+    for kind, (which, name) in enumerate((("core", tile_name(tile)), ("halo", halo_name(tile)))):
+        with atomic_output(folder / PARTS / name, overwrite=True) as temporary, temporary.open("wb") as file:
+            for path in inputs[which]:
+                (rows,) = load(path, name)
+                file.write(data := np.ascontiguousarray(rows).view(np.uint8).data)
+                checks[kind] = zlib.crc32(data, checks[kind])
+                counts[kind] += len(rows)
+                if which == "core":
+                    means = _get_positions(rows).astype(np.float64)
+                    low, high = np.minimum(low, means.min(axis=0)), np.maximum(high, means.max(axis=0))
+        os.replace(folder / PARTS / name, folder / name)
+    return {"rows": np.array(counts), "checks": np.array(checks), "bounds": np.stack([low, high])}

@@ -97,9 +97,12 @@ def test_damaged_tiles_are_written_again_on_request(
     succeeds(command_line, tmp_path, *words)
     before = files_of(tmp_path / "tiles")
     flipped(tmp_path / "tiles" / name)
+    times = {path.name: path.stat().st_mtime_ns for path in (tmp_path / "tiles").glob("*.f32")}
     assert "skipped" in succeeds(command_line, tmp_path, *words).err
-    succeeds(command_line, tmp_path, *words, "-w")
+    assert "1 tile damaged" in succeeds(command_line, tmp_path, *words, "-w").err
     assert files_of(tmp_path / "tiles") == before
+    written = {path for path, then in times.items() if (tmp_path / "tiles" / path).stat().st_mtime_ns != then}
+    assert written == {name.replace("tile-", kind).replace("halo-", kind) for kind in ("tile-", "halo-")}
 
 
 def test_damaged_tiles_of_a_work_folder_are_written_again_on_request(
@@ -190,7 +193,7 @@ def test_invalid_options_are_rejected_before_any_work(
             return client(address, **{**more, "timeout": "1s"})
 
         monkeypatch.setattr(distributed, "Client", hasty)
-    monkeypatch.setattr(ingest_module, "pour", lambda *_: pytest.fail("poured"))
+    monkeypatch.setattr(ingest_module, "Pouring", lambda *_: pytest.fail("poured"))
     tiled = ("simplify", place / "town.ply", "-n", 300, "--tile-rows", "700", "-o", "deep/a.ply")
     assert told in refused(command_line, tmp_path, *tiled, *options, status=1)
     assert not list(tmp_path.iterdir())

@@ -1,6 +1,8 @@
 """Scenes streamed into tiles: every row once, halos by their definition, whatever order and blocks."""
 
 import json
+import subprocess
+import sys
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -11,10 +13,12 @@ from g2ard.errors import InputError, OutputError
 from g2ard.io import write_splats
 from g2ard.io.tile_store import TileStore, packed
 from g2ard.scene.kdtree import Sampler
+from g2ard.tiles.executor import executor
 from g2ard.tiles.ingest import ingest
 from helpers.commands import succeeds
 from helpers.ingested import as_set, assert_same_sets, halos_of, saved, tiles_of, town
 from helpers.interruptions import interrupt_at
+from helpers.level_files import files_of
 from helpers.opened import read_scene
 from helpers.ply_files import columns, save
 
@@ -253,13 +257,47 @@ def test_too_little_disk_space_is_reported_first(tmp_path: Path, monkeypatch: py
         ingest(source, tmp_path / "tiles", tile_rows=2000)
 
 
-def test_an_interrupted_ingest_leaves_nothing(tmp_path: Path) -> None:
-    source, folder = saved(tmp_path / "town.ply", town()), tmp_path / "deep" / "tiles"
-    whole = ingest(source, tmp_path / "whole", tile_rows=900)
+def test_an_ingest_that_has_done_nothing_leaves_nothing(tmp_path: Path) -> None:
+    source = saved(tmp_path / "town.ply", town())
     with pytest.raises(KeyboardInterrupt):
-        ingest(source, folder, tile_rows=900, block_rows=500, progress=interrupt_at("tiles", 2500))
-    assert not (tmp_path / "deep").exists()
-    assert ingest(source, folder, tile_rows=900).tiles == whole.tiles
+        ingest(source, tmp_path / "deep" / "tiles", tile_rows=900, progress=interrupt_at("sample", 0))
+    assert [path.name for path in tmp_path.iterdir()] == ["town.ply"]
+
+
+KILLED = """
+import os, sys
+from g2ard.tiles.executor import executor
+from g2ard.tiles.ingest import ingest
+
+def die(stage, done, total, info=None):
+    if stage == sys.argv[3] and done >= 2500:
+        os._exit(9)
+
+if __name__ == "__main__":
+    with executor(int(sys.argv[4])) as runs:
+        ingest(sys.argv[1], sys.argv[2], tile_rows=900, block_rows=500, runs=runs, progress=die)
+"""
+
+
+@pytest.mark.parametrize(("stage", "workers"), [("sample", 1), ("tiles", 2), ("write", 1)])
+def test_a_killed_ingest_continues(tmp_path: Path, stage: str, workers: int) -> None:
+    source, folder, script = saved(tmp_path / "town.ply", town()), tmp_path / "tiles", tmp_path / "killed.py"
+    whole = ingest(source, tmp_path / "whole", tile_rows=900)
+    script.write_text(KILLED)
+    words = [sys.executable, script, source, folder, stage, str(workers)]
+    assert subprocess.run(words, check=False).returncode == 9
+    told = list[tuple[str, int]]()
+    ingest(source, folder, tile_rows=900, block_rows=500, progress=lambda *words: told.append(words[:2]))
+    assert next(done for name, done in told if name == stage) >= 2500
+    assert files_of(folder) == files_of(whole.folder)
+
+
+def test_workers_change_no_bit(tmp_path: Path) -> None:
+    paths = [saved(tmp_path / "a.ply", town()), saved(tmp_path / "b.splat", town(2000, seed=1))]
+    first = ingest(paths, tmp_path / "one", tile_rows=900)
+    with executor(2) as runs:
+        ingest(paths, tmp_path / "two", tile_rows=900, block_rows=500, runs=runs)
+    assert files_of(tmp_path / "two") == files_of(first.folder)
 
 
 def test_the_command(tmp_path: Path, command_line) -> None:
@@ -277,6 +315,8 @@ def test_the_command(tmp_path: Path, command_line) -> None:
     assert f"4,000 Gaussians in {len(store.tiles)} tiles" in said
 
     assert "skipped" in succeeds(command_line, tmp_path, *given, "again.json").err
+    dry = ("ingest", "a.ply", "--tile-rows", "1k", "--workers", 2, "--dry-run")
+    assert "3,000 rows in 3 tiles, 2 at a time" in succeeds(command_line, tmp_path, *dry).err
     status, _, said = command_line("ingest", "a.ply", "-o", "deep/tiles", cwd=tmp_path)
     assert status == 1
     assert "another scene" in said

@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 from g2ard.errors import InputError, OutputError
-from g2ard.io import read_cloud, write_points
+from g2ard.io import Source, read_cloud, write_points
 from g2ard.io.tile_store import packed
 from g2ard.io.types import Points
+from g2ard.jobs.chosen_points import PointChoice
 from g2ard.progress import silent
 from g2ard.stages.lift import LiftConfig, lift
 from g2ard.tiles.executor import executor
@@ -79,7 +80,7 @@ def test_lifted_tiles_are_the_lifted_cloud(tmp_path: Path) -> None:
     whole = lift(*vars(read_cloud(path).points).values())
     assert (store.count, store.sh_degree) == (60_000, 0)
     assert len(store.tiles) >= 3
-    assert not (tmp_path / "tiles" / ".points").exists()
+    assert not (tmp_path / "tiles" / ".parts").exists()
 
     near = (points.positions - store.offset).astype(np.float32)
     right = np.concatenate([core for core, _ in store.tree.route(near)])  # each tile's points, in order
@@ -124,23 +125,54 @@ def test_several_clouds_are_one(tmp_path: Path) -> None:
         ingest([paths[0], saved(tmp_path / "scene.ply", town(50))], tmp_path / "both")
 
 
-@pytest.mark.parametrize("stage", ["sample", "tiles", "lift"])
+@pytest.mark.parametrize("name", ["a.laz", "a.xyz"])
+def test_workers_change_no_bit(tmp_path: Path, name: str) -> None:
+    """A file that can be read from any row, and one that only this process reads."""
+    points, paths = streets(4000), [tmp_path / name, tmp_path / "b.ply"]
+    if name.endswith("laz"):
+        las(paths[0], points)
+    else:
+        np.savetxt(paths[0], np.hstack([points.positions, np.rint(255 * points.colors)]), "%.3f")
+    ply(paths[1], streets(3000, 1))
+    sources = [Source(path, others=paths[1:]) for path in [paths[0]] * 2]
+    for source in sources:
+        PointChoice(where="z > 0.1").narrow(source)
+    first = ingest(sources[0], tmp_path / "one", tile_rows=900)
+    with executor(2) as runs:
+        ingest(sources[1], tmp_path / "two", tile_rows=900, block_rows=500, runs=runs)
+    assert files_of(tmp_path / "two") == files_of(first.folder)
+    assert [note.code for note in first.notes].count("chosen") == 2
+
+
+@pytest.mark.parametrize("stage", ["sample", "tiles", "lift", "write"])
 def test_an_interrupted_lift_continues_where_it_was(tmp_path: Path, stage: str) -> None:
     path, folder = ply(tmp_path / "cloud.ply", streets(3000)), tmp_path / "tiles"
     whole = ingest(path, tmp_path / "whole", tile_rows=800)
     with pytest.raises(KeyboardInterrupt):
         ingest(path, folder, tile_rows=800, block_rows=300, progress=interrupt_at(stage, 1200))
-    assert folder.exists() == (stage == "lift")
     stages = []
-    told = list(folder.glob(".points/lifted-*"))
-    store = ingest(path, folder, tile_rows=800, progress=lambda *words: stages.append(words))
-    begun = next(done for name, done, *_ in stages if name == "lift")
-    assert bool(told) == ("tiles" not in {name for name, *_ in stages}) == (begun > 0) == (stage == "lift")
+    store = ingest(path, folder, tile_rows=800, block_rows=300, progress=lambda *words: stages.append(words))
+    assert next(done for name, done, *_ in stages if name == stage) >= 300  # a tile, or four parts
     assert not list(folder.glob(".*"))
     assert files_of(folder) == files_of(whole.folder)
     assert (store.tiles, store.key) == (whole.tiles, whole.key)
     manifest = json.loads((folder / "tiles.json").read_text())
     assert manifest["settings"]["lift"]["neighbors"] == 10
+
+
+@pytest.mark.parametrize("stage", ["tiles", "lift", "done"])
+def test_a_damaged_tile_is_lifted_again(tmp_path: Path, stage: str) -> None:
+    """The same with its halo of discs around it, and in a call that continues an interrupted one."""
+    path, folder = ply(tmp_path / "cloud.ply", streets(3000)), tmp_path / "tiles"
+    ingest(path, folder, tile_rows=300)
+    before = files_of(folder)
+    (folder / "halo-00002.f32").unlink()
+    with (folder / "tile-00005.f32").open("r+b") as file:
+        file.truncate(100)
+    with nullcontext() if stage == "done" else pytest.raises(KeyboardInterrupt):
+        ingest(path, folder, tile_rows=300, overwrite=True, progress=interrupt_at(stage, 100))
+    ingest(path, folder, tile_rows=300, overwrite=True)
+    assert files_of(folder) == before
 
 
 def test_points_of_another_cloud_are_not_continued(tmp_path: Path) -> None:

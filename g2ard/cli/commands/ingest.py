@@ -3,21 +3,25 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from g2ard.cli import options as opt
-from g2ard.cli.budget_options import Count
 from g2ard.cli.command import command
 from g2ard.cli.outputs import refuse_file
 from g2ard.cli.run import Run
+from g2ard.cli.work_folder import read_tiling
 from g2ard.progress import plural
-from g2ard.system.peak_memory import peak_rss
+from g2ard.system.peak_memory import peak_rss_of_all
 
 if TYPE_CHECKING:
-    from g2ard.io import Source
+    from g2ard.jobs.memory import TilePlan
+
+_FEW_ROWS = 500_000
+"""Rows below which processes take longer to start than they save."""
 
 
 @command(
@@ -26,7 +30,8 @@ if TYPE_CHECKING:
     settings="g2ard.stages.lift:LiftConfig",
     scenes=True,
     points=True,
-    without=("seed",),
+    tiles=True,
+    without=("seed", "work"),
 )
 def ingest(
     run: Run,
@@ -37,37 +42,40 @@ def ingest(
     output: Annotated[
         Path, typer.Option("-o", "--output", metavar="DIR", help="Output folder for the tiles.")
     ],
-    tile_rows: Annotated[
-        Count | None,
-        typer.Option(
-            parser=Count.parse_absolute, metavar="COUNT", help="Maximum Gaussians per tile; 5M by default."
-        ),
-    ] = None,
     dry_run: opt.DryRunOption = False,
 ) -> None:
     """Split a scene of any size into tiles."""
     from g2ard.io import Source
+    from g2ard.jobs.memory import WRITING_TIMES, plan_tiles
     from g2ard.stages.lift import LiftConfig
-    from g2ard.tiles.ingest import TILE_ROWS
+    from g2ard.tiles.executor import executor
     from g2ard.tiles.ingest import ingest as into_tiles
 
+    if not dry_run:
+        refuse_file(output, "tiles")
     source = Source(scenes[0], run.render_model, scenes[1:])
     opt.choose_points(run, source)
+    tiling = read_tiling(run, None, output)
+    stream = source.cloud() if source.kind == "points" else source.scene
+    if tiling.workers is None and tiling.scheduler is None and stream.count < _FEW_ROWS:
+        tiling = replace(tiling, workers=1)
+    plan = plan_tiles(stream, tiling, WRITING_TIMES)
     if dry_run:
-        _tell_plan(run, source, tile_rows)
+        _tell_plan(run, plan)
         return
-    refuse_file(output, "tiles")
     run.claim("--output", output, folder=True)
     began = time.perf_counter()
-    store = into_tiles(
-        source,
-        output,
-        tile_rows=TILE_ROWS if tile_rows is None else int(tile_rows.value),
-        lift=run.settled(LiftConfig())[1],
-        render_model=run.render_model,
-        overwrite=run.overwrite,
-        **run.callbacks,
-    )
+    with executor(plan.workers, max(1, tiling.usable_cores // plan.workers), tiling.scheduler) as runs:
+        store = into_tiles(
+            source,
+            output,
+            tile_rows=tiling.most_rows,
+            lift=run.settled(LiftConfig())[1],
+            render_model=run.render_model,
+            overwrite=run.overwrite,
+            runs=runs,
+            **run.callbacks,
+        )
     seconds = time.perf_counter() - began
     run.kept.append(f"{output} is written")
     for note in store.notes:
@@ -91,21 +99,24 @@ def ingest(
             "offset": store.offset,
             "notes": {note.code: note.count for note in store.notes},
             "seconds": seconds,
-            "peak_rss": peak_rss(),
+            "peak_rss": peak_rss_of_all(),
         }
     )
 
 
-def _tell_plan(run: Run, source: Source, tile_rows: Count | None) -> None:
+def _tell_plan(run: Run, plan: TilePlan) -> None:
     """Print the number of tiles, and the rough memory and disk that writing them takes."""
-    from g2ard.jobs.memory import plan_tiles
-    from g2ard.jobs.tile_options import Tiling
-
-    stream = source.cloud() if source.kind == "points" else source.scene
-    plan = plan_tiles(stream, Tiling(None if tile_rows is None else int(tile_rows.value), workers=1))
     run.answer(
-        f"{plan.count:,} rows in {plural(plan.tiles, 'tile')}: roughly {plan.bytes / 1e6:,.0f} MB, and "
-        f"{plan.disk / 1e6:,.0f} MB of disk"
+        f"{plan.count:,} rows in {plural(plan.tiles, 'tile')}, {plan.workers} at a time: roughly "
+        f"{plan.bytes / 1e6:,.0f} MB, and {plan.disk / 1e6:,.0f} MB of disk"
     )
     run.say_dry()
-    run.result({"rows": plan.count, "tiles": plan.tiles, "bytes": plan.bytes, "disk": plan.disk})
+    run.result(
+        {
+            "rows": plan.count,
+            "tiles": plan.tiles,
+            "workers": plan.workers,
+            "bytes": plan.bytes,
+            "disk": plan.disk,
+        }
+    )
