@@ -21,6 +21,7 @@ from g2ard.config.choices import (
     is_made,
 )
 from g2ard.errors import require_torch
+from g2ard.io.detect import suffixes
 
 if TYPE_CHECKING:
     from g2ard.cli.run import Run
@@ -30,7 +31,7 @@ SceneArgument = Annotated[
     Path,
     typer.Argument(
         metavar="SCENE",
-        help="Scene: .ply (3DGS), SOG, .spz, .glb, .splat, .ksplat, .compressed.ply or OpenUSD.",
+        help=f"Scene: {suffixes('splats')}, a SOG folder or a run.",
     ),
 ]
 OthersArgument = Annotated[

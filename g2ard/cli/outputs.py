@@ -43,10 +43,9 @@ def read_budget(run: Run, *, optional: bool = False) -> Budget | None:
 
 def refuse_file(path: Path, what: str) -> None:
     """Raise a usage error if the name of an output folder is that of a scene's file; `what` it holds."""
-    from g2ard.io.scene_formats import FORMATS
+    from g2ard.io.scene_formats import SUFFIXES
 
-    suffixes = (*(known.suffix for known in FORMATS.values()), ".json", ".html")
-    if path.name.lower().endswith(suffixes) and not path.is_dir():
+    if path.name.lower().endswith((*SUFFIXES, ".json", ".html")) and not path.is_dir():
         folder = path.with_name(path.name.split(".")[0] or "out")
         raise typer.BadParameter(
             f"--output: {path} names a file, but a folder is written ({what}); give {folder}"

@@ -29,7 +29,7 @@ from g2ard.io.atomic import atomic_output, check_output, drop_empty, drop_tempor
 from g2ard.io.jsonfile import read_json
 from g2ard.io.lock import check_unlocked, locked
 from g2ard.io.reports import Report, plain
-from g2ard.io.scene_formats import FORMATS
+from g2ard.io.scene_formats import SUFFIXES
 from g2ard.io.types import ViewSet
 from g2ard.jobs.budget import DEVICES, Budget
 from g2ard.jobs.cost import LARGEST_DENSE
@@ -300,7 +300,7 @@ class RunFolder:
 
     def _other_scenes(self) -> list[Path]:
         """Return the scene's file names in other formats."""
-        names = (self.path / f"scene.{name}" for name in FORMATS)
+        names = (self.path / f"scene{suffix}" for suffix in SUFFIXES)
         return [path for path in names if path != self.scene]
 
 

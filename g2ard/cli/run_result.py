@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from g2ard.cli.run import Run
-from g2ard.io.scene_formats import FORMATS, scene_format, written_bytes
+from g2ard.io.scene_formats import SUFFIXES, scene_format, written_bytes
 from g2ard.progress import plural
 
 if TYPE_CHECKING:
@@ -176,8 +176,7 @@ def say_fit(run: Run, source: Path, budget: Budget, name: str) -> None:
         return
     fits = f"{source.name} has {source.stat().st_size / 1e6:.2f} MB, which already fits {budget.fit}"
     ours = scene_format(name).suffix
-    suffixes = (known.suffix for known in FORMATS.values())
-    if next((suffix for suffix in suffixes if source.name.lower().endswith(suffix)), None) == ours:
+    if next((suffix for suffix in SUFFIXES if source.name.lower().endswith(suffix)), None) == ours:
         run.say(f"nothing to do: {fits}")
     else:
         run.say(f"{fits}; only its size as {ours} counts")

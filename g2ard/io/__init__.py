@@ -2,11 +2,12 @@
 
 | reads | from |
 |---|---|
-| `read_splats`, `Source` | .ply (3DGS), .compressed.ply, SOG, .spz, .glb, .splat, .ksplat, OpenUSD |
-| `read_points`, `read_cloud` | .ply, .las, .laz, .e57, COLMAP points3D |
-| `read_views`, `read_view_set` | COLMAP, transforms.json, trainers' cameras, data sets, g2ard's own |
+| `read_splats`, `Source` | Gaussian scenes |
+| `read_points`, `read_cloud` | coloured point clouds |
+| `read_views`, `read_view_set` | cameras, of data sets or trainers |
 
-The first of each row returns data; the second also has notes about the file (`Note`).
+`READERS` in `g2ard.io.detect` lists the formats. The first of each row returns data; the second also has
+notes about the file (`Note`).
 `find_views` finds the cameras that trainers leave beside a scene. Readers are imported on first use.
 """
 

@@ -21,8 +21,8 @@ Kind = Literal["splats", "points", "views"]
 
 READERS: dict[Kind, dict[str, tuple[str, ...]]] = {
     "splats": {
-        "ply": (),
-        "compressed_ply": (),
+        "ply": (".ply",),
+        "compressed_ply": (".compressed.ply",),
         "sog": (".sog", "meta.json", "lod-meta.json"),
         "spz": (".spz",),
         "glb": (".glb", ".gltf"),
@@ -32,7 +32,7 @@ READERS: dict[Kind, dict[str, tuple[str, ...]]] = {
         "tiles": (),
     },
     "points": {
-        "cloud_ply": (),
+        "cloud_ply": (".ply",),
         "las": (".las", ".laz"),
         "e57": (".e57",),
         "points3d": ("points3d.bin", "points3d.txt"),
@@ -102,7 +102,7 @@ MANIFEST = "tiles.json"
 PARTS = ".parts"
 """Folder of the steps of an unfinished one."""
 
-_CLOUDS = (".las", ".laz", ".e57", ".pcd", ".ply")
+_CLOUDS = (*READERS["points"]["las"], *READERS["points"]["e57"], ".pcd", ".ply")
 """Suffixes of files that a folder of clouds may hold."""
 
 _BESIDE = (".lax", ".lasx", ".copc", ".prj", ".wkt", ".xml", ".txt", ".md", ".pdf", ".json")
@@ -110,6 +110,16 @@ _BESIDE = (".lax", ".lasx", ".copc", ".prj", ".wkt", ".xml", ".txt", ".md", ".pd
 
 _MOST_INSPECTED_FILES = 64  # maximum files of a folder to inspect for suggestions
 _MOST_SEARCHED_FILES = 256  # maximum files of a folder and those below to look for signs of other programs
+
+
+def suffixes(kind: Kind) -> str:
+    """Return the suffixes of files of a kind, as messages list them.
+
+    >>> suffixes("splats")[:28]
+    '.ply, .compressed.ply, .sog,'
+    """
+    ends = (end for format_ends in READERS[kind].values() for end in format_ends if end.startswith("."))
+    return ", ".join(ends)
 
 
 def kind(path: AnyPath) -> Kind:
@@ -123,7 +133,7 @@ def kind(path: AnyPath) -> Kind:
 def may_hold_views(path: Path) -> bool:
     """Return whether a file's name is not one of scenes or point clouds."""
     named = _BY_NAME.get(path.name.lower()) or _BY_NAME.get(path.suffix.lower())
-    return path.suffix.lower() != ".ply" and (named is None or KINDS[named] == "views")
+    return named is None or KINDS[named] == "views"
 
 
 def file_format(path: AnyPath) -> str:
@@ -168,10 +178,10 @@ def _of_file(path: Path, modified: int, size: int) -> str:
     _check_content(path)
     if path.name.lower() == "meta.json":
         _by_gsplat(path.parent)
-    if found := _BY_NAME.get(path.name.lower()) or _BY_NAME.get(suffix):
-        return found
     if suffix == ".ply":
         return _ply_format(path)
+    if found := _BY_NAME.get(path.name.lower()) or _BY_NAME.get(suffix):
+        return found
     if suffix == ".json":
         return _json_format(path)
     reason = ""
@@ -184,8 +194,8 @@ def _of_file(path: Path, modified: int, size: int) -> str:
         except InputError as error:
             reason = f", and no table of points: {error.message}"
     raise InputError(
-        f"unknown format {path.suffix!r}{reason} (scenes: .ply .sog .spz .glb .gltf .splat .ksplat .usda "
-        ".usdc; point clouds: .ply .las .laz .e57 .pcd .xyz .csv; views: a COLMAP folder, a .json, or a run)",
+        f"unknown format {path.suffix!r}{reason} (scenes: {suffixes('splats')}; point clouds: "
+        f"{suffixes('points')}, .csv; views: a COLMAP folder, a .json, or a run)",
         path=path,
     )
 
@@ -197,19 +207,16 @@ def _check_content(path: Path) -> None:
         return
     if not sign.reads:
         raise sign.error(path)
-    known = _OWN.get(suffix, () if suffix not in _BY_NAME and path.name.lower() not in _BY_NAME else None)
-    if known is not None and sign.reads not in known:
+    named = _BY_NAME.get(suffix)
+    fits = sign.reads == suffix or (named in _PACKED and named == _BY_NAME.get(sign.reads))
+    counts = suffix == ".bin" and path.name.lower() in _BY_NAME  # COLMAP's begin with a count, of any bytes
+    if not fits and not counts:
         hint = f"rename it to {path.stem}{sign.reads}"
         raise InputError(f"is {sign.what} in spite of its name", path=path, hint=hint)
 
 
-_OWN = {
-    **{suffix: (suffix,) for suffix in (".ply", ".sog", ".spz", ".glb", ".splat", ".ksplat", ".e57", ".pcd")},
-    **dict.fromkeys((".las", ".laz"), (".las",)),
-    **dict.fromkeys((".json", ".txt", ".csv", ".xyz", ".pts", ".asc", ".gltf"), ()),
-    **dict.fromkeys((".usd", ".usda", ".usdc", ".usdz"), (".usda", ".usdc", ".usdz")),
-}
-"""Suffixes of formats, and which of those that content tells they may have."""
+_PACKED = ("las", "usd")
+"""Formats with suffixes of which each may hold what content tells as another of them."""
 
 
 def run_scene(path: AnyPath) -> Path:
@@ -217,9 +224,9 @@ def run_scene(path: AnyPath) -> Path:
     path = Path(path)
     if not (path / "report.json").is_file():
         return path
-    from g2ard.io.scene_formats import FORMATS
+    from g2ard.io.scene_formats import SUFFIXES
 
-    files = (path / f"scene{known.suffix}" for known in FORMATS.values())
+    files = (path / f"scene{suffix}" for suffix in SUFFIXES)
     return next((file for file in files if file.is_file()), path)
 
 
@@ -387,7 +394,7 @@ def _unsupported(path: Path) -> str:
     files = (
         file
         for file in sorted(path.iterdir())
-        if file.suffix.lower() in (".ply", ".json", *_BY_NAME) and file.is_file()
+        if file.suffix.lower() in (".json", *_BY_NAME) and file.is_file()
     )
     for file in islice(files, _MOST_INSPECTED_FILES):
         with suppress(InputError):

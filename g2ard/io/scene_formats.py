@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -23,7 +24,7 @@ class SceneFormat(NamedTuple):
         options: names of its options.
         models: whether it can state the render model.
         axes: of its coordinates, by definition or unless it states others; None if scenes bring their own.
-        lossy: whether it rounds values to fewer bits than float32.
+        loss: 0 for one that keeps float32, 1 for one that loses little, 2 for one that loses more.
         tells: whether its writer takes `progress`.
     """
 
@@ -33,21 +34,29 @@ class SceneFormat(NamedTuple):
     options: tuple[str, ...] = ()
     models: bool = True
     axes: str | None = None
-    lossy: bool = False
+    loss: int = 0
     tells: bool = False
+
+    def writer(self) -> Any:
+        """Return the module that writes it."""
+        return import_module(f"g2ard.io.{self.module}")
 
 
 FORMATS: dict[FormatName, SceneFormat] = {
-    "compressed.ply": SceneFormat(".compressed.ply", "compressed_ply", lossy=True),
+    "compressed.ply": SceneFormat(".compressed.ply", "compressed_ply", loss=1),
     "ply": SceneFormat(".ply", "ply", options=("normals", "layout")),
-    "sog": SceneFormat(".sog", "sog_write", lossy=True, tells=True),
-    "spz": SceneFormat(".spz", "spz", options=("spz_version", "axes"), axes="RUB", lossy=True, tells=True),
+    "sog": SceneFormat(".sog", "sog_write", loss=1, tells=True),
+    "spz": SceneFormat(".spz", "spz", options=("spz_version", "axes"), axes="RUB", loss=2, tells=True),
     "glb": SceneFormat(".glb", "glb", options=("compress",), models=False, axes="LUF"),
-    "splat": SceneFormat(".splat", "splat", models=False, lossy=True),
+    "splat": SceneFormat(".splat", "splat", models=False, loss=2),
     "usda": SceneFormat(".usda", "usd", models=False, axes="RUB", tells=True),
     "usdc": SceneFormat(".usdc", "usd", models=False, axes="RUB", tells=True),
 }
 """Formats by name, longer suffixes first."""
+
+SUFFIXES = tuple(known.suffix for known in FORMATS.values())
+WRITTEN = ", ".join(SUFFIXES)
+"""Suffixes of written scenes, for messages."""
 
 LARGEST_SPZ = 10_485_760
 """Gaussians that readers of SPZ from before May 2026 accept."""
@@ -55,7 +64,7 @@ LARGEST_SPZ = 10_485_760
 _VISIBLE_ROUNDING = 0.01
 """Rounding of positions that can be visible, as a share of a typical Gaussian's scale."""
 
-_FOLDER = SceneFormat("meta.json", "sog_write", "write_folder", lossy=True, tells=True)
+_FOLDER = SceneFormat("meta.json", "sog_write", "write_folder", loss=1, tells=True)
 
 
 def scene_format(path: AnyPath) -> SceneFormat:
@@ -70,8 +79,7 @@ def scene_format(path: AnyPath) -> SceneFormat:
     for output_format in FORMATS.values():
         if name.endswith(output_format.suffix):
             return output_format
-    known = ", ".join(f.suffix for f in FORMATS.values())
-    raise OutputError(f"scenes are written as {known}, or as a SOG folder (NAME/meta.json)", path=path)
+    raise OutputError(f"scenes are written as {WRITTEN}, or as a SOG folder (NAME/meta.json)", path=path)
 
 
 def files_of(path: Path) -> list[Path]:
@@ -126,13 +134,13 @@ def check_positions(path: AnyPath, splats: Splats, count: int | None = None) -> 
 
     Gaussians of surfaces widen with the root of the ratio when the scene is reduced to `count`.
     """
-    if scene_format(path).module == "spz" and len(splats):
+    writer = scene_format(path).writer()
+    if hasattr(writer, "check_far") and len(splats):
         from g2ard.io.packing import as_packed
-        from g2ard.io.spz import check_far
 
         packed = as_packed(Path(path), splats)
         widened = (len(splats) / (count or len(splats))) ** 0.5
-        check_far(Path(path), packed, packed.means.astype(float), widened)
+        writer.check_far(Path(path), packed, packed.means.astype(float), widened)
 
 
 @dataclass
@@ -170,11 +178,11 @@ class Rounding:
 def axes_note(path: AnyPath, options: dict[str, Any]) -> str | None:
     """Return a note on the axes of a written file if programs differ in them; `options` are the writer's."""
     output_format, axes = scene_format(path), options.get("axes")
-    if output_format.suffix != ".spz" or (axes is not None and options.get("spz_version", 3) == 4):
+    if "axes" not in output_format.options or (axes is not None and options.get("spz_version", 3) == 4):
         return None
     if axes == "RDF":
         return (
-            "has the coordinates of a .ply, as splat-transform and SuperSplat read .spz; programs that "
+            "has the coordinates of a .ply, as splat-transform and SuperSplat read it; programs that "
             "follow the definition show it turned by half a turn"
         )
     return (

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import warnings
-from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -27,8 +26,8 @@ def read_splats(path: str | Path, *, render_model: RenderModel | None = None) ->
     """Read a Gaussian scene.
 
     Args:
-        path: .ply (3DGS), .compressed.ply, .sog or a SOG folder, .spz, .glb, .splat, .ksplat, OpenUSD
-            (.usda, .usdc); or a folder written by `distill` or `ingest`.
+        path: a file or SOG folder of any format in `g2ard.io.detect.READERS`, or a folder written by
+            `distill` or `ingest`.
         render_model: "classic" or "antialiased"; None means what the file says, classic if it says nothing.
 
     Returns:
@@ -49,11 +48,9 @@ def read_splats(path: str | Path, *, render_model: RenderModel | None = None) ->
 def read_back(path: str | Path, splats: Splats) -> Splats:
     """Read what was written of a scene, where the scene is even if the format cannot say so."""
     read = read_splats(path)
-    if scene_format(path).module != "splat":
-        return read
-    import g2ard.io.splat as splat
-
-    return splat.read_back(Path(path), splats, read)
+    writer = scene_format(path).writer()
+    back: Splats = writer.read_back(Path(path), splats, read) if hasattr(writer, "read_back") else read
+    return back
 
 
 def check_scene_output(path: str | Path, overwrite: bool = False) -> Path:
@@ -76,8 +73,7 @@ def write_splats(
     """Write a Gaussian scene atomically.
 
     Args:
-        path: .ply (3DGS), .compressed.ply, .sog, .spz, .glb (KHR_gaussian_splatting), .splat, .usda,
-            .usdc; NAME/meta.json for a SOG folder.
+        path: a file of a format in `g2ard.io.scene_formats.FORMATS`, or NAME/meta.json for a SOG folder.
         splats: the scene, or a result that holds one.
         overwrite: whether to replace an existing file.
         progress: called while a format that takes long is packed.
@@ -117,7 +113,7 @@ def write_scene(
     check_type("splats", splats, Splats)
     output_format = check_options(path, options)
     check_scene_output(path, overwrite)
-    writer = getattr(import_module(f"g2ard.io.{output_format.module}"), output_format.function)
+    writer = getattr(output_format.writer(), output_format.function)
     told = {"progress": progress} if output_format.tells else {}
     error = writer(Path(path), splats, overwrite=overwrite, **told, **options)
     rounding = Rounding(far=bool((splats.narrowed().offset != splats.offset).any()))

@@ -81,6 +81,10 @@ _PATH = "a path has no photos: give views with `render --views`, such as transfo
 _EUROC = "`evo_traj euroc FILE --save_as_tum` converts it, and `g2ard register --poses` reads that"
 
 
+def _own(suffix: str, start: bytes, *words: bytes) -> Sign:
+    return Sign(f"a {suffix} file", "", (start,), words, reads=suffix)
+
+
 def _poses(
     what: str, *words: bytes, starts: tuple[bytes, ...] = (), names: str = "*", todo: str = _COLMAP
 ) -> Sign:
@@ -124,17 +128,17 @@ SIGNS = (
     Sign("a glTF packed by Draco", "export it without Draco", words=(b"KHR_draco_mesh_compression",)),
     Sign("a file of NumPy arrays", _SAVED, (_ZIP,), (b".npy",)),
     Sign("an Office document", "save the table as .csv", (_ZIP,), (b"[Content_Types].xml",)),
-    Sign("a .sog file", starts=(_ZIP,), words=(b"meta.json",), reads=".sog"),
+    _own(".sog", _ZIP, b"meta.json"),
     Sign("an OpenUSD file", starts=(_ZIP,), words=(b".usd",), reads=".usdz"),
-    Sign("a .spz file", starts=(_GZIP,), words=(b"NGSP",), reads=".spz"),
-    Sign("a .spz file", starts=(b"NGSP",), reads=".spz"),
+    _own(".spz", _GZIP, b"NGSP"),
+    _own(".spz", b"NGSP"),
     Sign("a .ply file", starts=(b"ply\n", b"ply\r"), reads=".ply"),
-    Sign("a .glb file", starts=(b"glTF",), reads=".glb"),
-    Sign("a .ksplat file", starts=(b"\0\1\0\0",), reads=".ksplat"),
-    Sign("a .las file", starts=(b"LASF",), reads=".las"),
+    _own(".glb", b"glTF"),
+    _own(".ksplat", b"\0\1\0\0"),
+    _own(".las", b"LASF"),
     Sign("an .e57 file", starts=(b"ASTM-E57",), reads=".e57"),
     Sign("an OpenUSD file", starts=(b"PXR-USDC", b"#usda"), reads=".usdc"),
-    Sign("a .pcd file", starts=(b"# .PCD",), reads=".pcd"),
+    _own(".pcd", b"# .PCD"),
     Sign("an archive (zip)", _UNPACK, (_ZIP, b"PK\5\6"), unless=(".sog", ".usdz")),
     Sign("an archive (gzip)", _UNPACK, (_GZIP,), unless=(".spz",)),
     Sign("an archive", _UNPACK, (b"7z\xbc\xaf\x27", b"Rar!\x1a", b"\x28\xb5\x2f\xfd", b"\xfd7zXZ", b"BZh"), unless=(".spz",)),

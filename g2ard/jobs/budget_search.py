@@ -80,7 +80,7 @@ def file_bytes(splats: Splats, name: str, **options: Any) -> int:
 
 def as_file(splats: Splats, name: str) -> Splats:
     """Return the scene as read back from the format of `name`: quantised and without unsupported fields."""
-    if scene_format(name).suffix in (".ply", ".usda", ".usdc"):
+    if not scene_format(name).loss:
         return splats
     with _written(splats, name) as path:
         return read_back(path, splats)

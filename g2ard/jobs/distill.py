@@ -486,8 +486,8 @@ def distill(
         size: longer side of the views in pixels; photos only shrink to it.
         preset: settings by name: "auto" measures the scene; "trained", "lift" or "noisy" names its kind;
             "paper" is the method of the paper, see `g2ard.preset`.
-        format: file format that `fit`, `min_psnr` and `min_ssim` are meant for: ply, compressed.ply, sog,
-            spz, glb, splat, usda or usdc.
+        format: file format that `fit`, `min_psnr` and `min_ssim` are meant for, a name in
+            `g2ard.io.scene_formats.FORMATS`.
         held_out: views to score on instead of the test split; `views` are then used for training only.
         up: (3,) direction away from the ground for generated views; None estimates it.
         clean: remove invisible and stray Gaussians first, like `g2ard clean`.

@@ -32,7 +32,7 @@ class DistillOptions(Settings):
         photos: targets: True for photos, skipping views without one; False for renders of the scene; None for
             each view's photo, or a render if it has none (sec. 3.1). A point cloud given with views needs
             their photos; without views, its lift renders the training images.
-        format: file format for a budget in bytes: ply, compressed.ply, sog, spz, glb, splat, usda or usdc.
+        format: file format for a budget in bytes, a name in `g2ard.io.scene_formats.FORMATS`.
         time: seconds that the whole run may take; recovery gets what the rest leaves.
         settings: values of `DistillConfig` by path, which override the preset.
 

@@ -56,7 +56,7 @@ def loss_warning(path: Path, splats: Splats, options: dict[str, Any]) -> str | N
 
     Nothing is compared if the format is exact, the scene is large or no view shows it.
     """
-    if not (scene_format(path).lossy or options.get("compress")) or len(splats) > _MOST_COMPARED_GAUSSIANS:
+    if not (scene_format(path).loss or options.get("compress")) or len(splats) > _MOST_COMPARED_GAUSSIANS:
         return None
     try:
         cameras = plan_pool(splats, _LOSS_VIEWS, size=_LOSS_SIZE, rows=_LOSS_ROWS).cameras
@@ -78,5 +78,4 @@ def loss_warning(path: Path, splats: Splats, options: dict[str, Any]) -> str | N
 
 def _better(name: str) -> str:
     """Name formats that lose less than that of a file."""
-    close = name.lower().endswith((".sog", "meta.json", ".compressed.ply"))
-    return ".ply loses nothing" if close else ".sog loses less, .ply nothing"
+    return ".ply loses nothing" if scene_format(name).loss == 1 else ".sog loses less, .ply nothing"

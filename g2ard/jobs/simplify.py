@@ -321,7 +321,7 @@ def simplify(
         fit: largest file, such as "5MB", or a device (see `Budget`).
         min_psnr: PSNR (dB) to keep against the scene, in generated views.
         min_ssim: SSIM to keep; with `min_psnr` both hold. `say` receives the result's quality.
-        format: file format for `fit`: ply, compressed.ply, sog, spz, glb, splat, usda or usdc.
+        format: file format for `fit`, a name in `g2ard.io.scene_formats.FORMATS`.
         views: cameras in world coordinates, or their path; the training split is used. "made" always
             generates views.
         blind: use no cameras at all.

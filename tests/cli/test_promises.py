@@ -104,7 +104,7 @@ CALLS: dict[str, tuple[str, str]] = {
         "simplify ball.ply -r 8 --views views.json --keep-region {} --set keep_times=9 -o out.ply",
     ),
     "simplify scene": (
-        ".ply SOG .spz .glb .splat .ksplat .compressed.ply OpenUSD",
+        ".ply .compressed.ply .sog .spz .glb .splat .ksplat .usda .usdc",
         "simplify {} -r 2 --no-views -o out.ply",
     ),
     "lift cloud": (".ply .las .laz COLMAP", "lift {} -o out.ply"),
@@ -148,10 +148,8 @@ WORDS: dict[str, dict[str, str]] = {
     "clean only": {kind: f"{kind} --strength 0.5" for kind in ("haze", "streak")},
     "simplify scene": {
         ".ply": "ball.ply",
-        "SOG": "a.sog",
         ".ksplat": "level2-sh2.ksplat",
-        "OpenUSD": "a.usda",
-        **{suffix: f"a{suffix}" for suffix in (".spz", ".glb", ".splat", ".compressed.ply")},
+        **{f".{name}": f"a.{name}" for name in FORMATS if name != "ply"},
     },
     "lift cloud": {
         "COLMAP": "given/project",
@@ -211,7 +209,7 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Write the files that `CALLS` and `WORDS` name."""
     folder = tmp_path_factory.mktemp("inputs")
     ball, cameras = checkered_ball(300), around(16, (48, 36))
-    for name in ("ball.ply", "a.spz", "a.glb", "a.splat", "a.compressed.ply", "a.sog", "a.usda"):
+    for name in ("ball.ply", *(f"a.{name}" for name in FORMATS if name != "ply")):
         g2ard.save(folder / name, ball)
     g2ard.save(folder / "sky.ply", under_a_sky(ball))
     for name in ("cloud.ply", "cloud.las", "cloud.laz"):
@@ -271,7 +269,7 @@ APART = {
     r"in \.NAME\.tiles": "tests/cli/test_resume.py",
     r"classification == 2": "tests/jobs/test_chosen_points.py",
     r"\.mp4 \(needs ffmpeg\)": "tests/test_documented_commands.py",
-    r"\.e57": "tests/io/test_e57.py",
+    r"\.(e57|gltf|usdz?|pcd|xyz\w*|pts|asc|neu)\b": "tests/io",
     r"page:10MB|one view as \.png": "tests/cli/test_pages.py and tests/cli/test_pictures.py",
     r"every 8th|fewer than 6|0\.2 and cuts splats at 3σ|4 keeps a quarter": "tests of what it means",
     r"0 uses all cores|0 runs all steps|or -1|1 - STRENGTH|4 is smaller|degree 3, 248 bytes": "the same",

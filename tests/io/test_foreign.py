@@ -201,6 +201,12 @@ def test_unknown_suffixes_of_known_content(tmp_path: Path, suffix: str) -> None:
         kind(path)
 
 
+def test_a_photo_is_not_to_be_renamed_to_its_own_name(tmp_path: Path) -> None:
+    Image.new("RGB", (8, 6)).save(tmp_path / "a.jpg")
+    with pytest.raises(InputError, match=r"unknown format '\.jpg' \(scenes: \.ply, \.compressed\.ply, "):
+        kind(tmp_path / "a.jpg")
+
+
 @pytest.mark.parametrize("suffix", ["crdownload", "part", "partial", "download", "opdownload"])
 def test_unfinished_downloads(tmp_path: Path, suffix: str) -> None:
     write_splats(tmp_path / "a.ply", scene())

@@ -16,7 +16,7 @@ from g2ard.cli.run_result import say_weight
 from g2ard.config.choices import NAMED_AXES, Axes, AxesName, PlyLayout, PointColor
 from g2ard.errors import InputError, OutputError
 from g2ard.io import Source
-from g2ard.io.scene_formats import SceneFormat, check_options, scene_format, written_bytes
+from g2ard.io.scene_formats import WRITTEN, SceneFormat, check_options, scene_format, written_bytes
 
 
 @command(
@@ -40,8 +40,7 @@ def convert(
             "-o",
             "--output",
             metavar="OUT",
-            help="Output: .ply, .compressed.ply, .sog, .spz, .glb, .splat, .usda, .usdc or NAME/meta.json; "
-            ".csv for a table of attributes.",
+            help=f"Output: {WRITTEN} or NAME/meta.json; .csv for a table of attributes.",
         ),
     ] = None,
     box: Annotated[
@@ -208,7 +207,7 @@ def _add_axes(
         raise InputError(
             f"{output_format.suffix} has {output_format.axes} axes by definition",
             path=output,
-            hint="write .spz (version 4), which can name others, or .ply, .sog or .splat, which name none",
+            hint="write a .ply, which has none",
         )
     return {**({} if axes == "RDF" else {"spz_version": 4}), **options, "axes": axes}
 

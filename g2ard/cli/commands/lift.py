@@ -11,6 +11,7 @@ from g2ard.cli.options import OutputOption, choose_points
 from g2ard.cli.run import Run
 from g2ard.cli.run_result import say_weight
 from g2ard.io import Source
+from g2ard.io.detect import suffixes
 from g2ard.progress import plural
 
 
@@ -18,7 +19,7 @@ from g2ard.progress import plural
 def lift(
     run: Run,
     cloud: Annotated[
-        Path, typer.Argument(metavar="CLOUD", help="Coloured points: .ply, .las, .laz, .e57 or COLMAP.")
+        Path, typer.Argument(metavar="CLOUD", help=f"Coloured points: {suffixes('points')} or COLMAP.")
     ],
     output: OutputOption,
     neighbors: Annotated[int, typer.Option(help="Nearest points to fit each disc's plane to.")] = 10,
