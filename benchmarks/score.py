@@ -12,7 +12,7 @@ from PIL import Image
 from benchmarks.rows import Row
 from g2ard.config.choices import BLACK, Colour
 from g2ard.io.images import as_saved, to_bytes
-from g2ard.rendering.metrics import Lpips, edge_psnr, psnr, ssim
+from g2ard.rendering.metrics import METRICS, Lpips
 from g2ard.rendering.renderer import RasterSettings, Renderer
 from g2ard.rendering.targets import Targets, mask_of
 from g2ard.scene.samples import evenly_spaced
@@ -22,6 +22,7 @@ __all__ = ["View", "figures", "pictured", "save_jpeg", "score"]
 
 _PICTURES = 32
 _QUALITY = 88
+_SCORES = ("psnr", "ssim", "edge_psnr")
 
 View = dict[str, Any]
 """A view's name, psnr, ssim, edge_psnr and lpips_NET, and whether it is black: in 8 bits, though its target
@@ -34,7 +35,7 @@ def figures(views: list[View]) -> Row:
     counted = [view for view in views if not view["black"]] or views
     means: Row = {
         name: float(np.mean([view[name] for view in counted]))
-        for name in ("psnr", "ssim", "edge_psnr", "lpips_vgg", "lpips_alex")
+        for name in (*_SCORES, "lpips_vgg", "lpips_alex")
         if name in views[0]
     }
     worst = min(view["psnr"] for view in counted)
@@ -70,8 +71,8 @@ def score(
         if eight_bit:
             image, target = as_saved(image), as_saved(target)
         mask = mask_of(targets, number)
-        view: View = {"name": name, "psnr": psnr(image, target, mask), "ssim": ssim(image, target, mask)}
-        view["edge_psnr"] = edge_psnr(image, target, mask)
+        view: View = {"name": name}
+        view |= {score: METRICS[score].measure(image, target, mask) for score in _SCORES}
         view |= {f"lpips_{net}": model(image, target) for net, model in (lpips or {}).items()}
         view["black"] = not to_bytes(image).any() and bool(to_bytes(target).any())
         views.append(view)

@@ -140,7 +140,8 @@ def describe_loss(
 ) -> str | None:
     """Describe what recovery lost in the views of a kind, if anything; `hint` ends a warning."""
     what = f"{kind.kind} views"
-    ssim = kind.ssim.gain if kind.ssim else 0.0
+    change = kind.change("ssim")
+    ssim = change.gain if change else 0.0
     if ssim < -_REPORTED_SSIM_LOSS and kind.psnr.gain > 0:  # neither scene is better
         return f"recovery lost {-ssim:.3f} SSIM and gained {kind.psnr.gain:.2f} dB in {what}"
     if kind.psnr.gain < -_REPORTED_PSNR_LOSS or ssim < -_REPORTED_SSIM_LOSS:

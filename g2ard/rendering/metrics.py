@@ -1,7 +1,8 @@
 """Scores of float images in [0, 1]: PSNR, PSNR and correlation of gradients, lost detail, SSIM, LPIPS."""
 
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -132,6 +133,31 @@ def _float32(image: _Image) -> NDArray[np.float32]:
 
 def _counts(mask: NDArray[np.bool_] | None) -> NDArray[np.bool_] | None:
     return None if mask is None else np.ascontiguousarray(mask)
+
+
+class Metric(NamedTuple):
+    """A score of images, and its column in tables of means.
+
+    Args:
+        measure: function of an image, its target and the (H, W) pixels that count.
+        heading: column of tables.
+        digits: decimals in tables.
+        legend: line under tables, where the heading is not enough.
+    """
+
+    measure: Callable[[_Image, _Image, NDArray[np.bool_] | None], float]
+    heading: str
+    digits: int
+    legend: str = ""
+
+
+METRICS = {
+    "psnr": Metric(psnr, "PSNR", 2, "PSNR in dB"),
+    "ssim": Metric(ssim, "SSIM", 4),
+    "edge_psnr": Metric(edge_psnr, "edges", 2, "edges: PSNR of the images' gradients, in dB"),
+    "detail": Metric(detail, "detail", 2, "detail: their correlation, at most 1"),
+}
+"""Metrics by the names of their fields in `g2ard.stages.evaluate.Scores`."""
 
 
 _MEAN = (-0.030, -0.088, -0.188)

@@ -228,9 +228,9 @@ _ADAPT = "g2ard adapt {} --views photos/ -o adapted.ply          # colours of ot
 def describe_edges(kinds: Sequence[KindScore]) -> str | None:
     """Return the scores of thin structures, None without them."""
     found = [
-        f"{kind.kind} {kind.edge_psnr.before:.2f} → {kind.edge_psnr.after:.2f} dB"
+        f"{kind.kind} {change.before:.2f} → {change.after:.2f} dB"
         for kind in kinds
-        if kind.edge_psnr
+        if (change := kind.change("edge_psnr"))
     ]
     return f"Edges, wires and text (PSNR of gradients): {', '.join(found)}." if found else None
 
@@ -240,8 +240,9 @@ def summarize_run(report: RunReport) -> str:
 
     >>> from types import SimpleNamespace
     >>> from g2ard.report.run import Change
+    >>> from g2ard.stages.evaluate import Scores
     >>> change = Change(30.0, 36.6)
-    >>> kinds = [KindScore("near", 12, change, change, "near_0003", change, 0)]
+    >>> kinds = [KindScore("near", 12, Scores(30.0), Scores(36.6), "near_0003", change, 0)]
     >>> made, size = "500 of 5,000 Gaussians", "800×600 px"
     >>> report = SimpleNamespace(kinds=kinds, made=made, size=size, against="photos", own_size=None)
     >>> summarize_run(report)  # doctest: +ELLIPSIS
@@ -268,8 +269,8 @@ def summarize_run(report: RunReport) -> str:
 def _find_worsened(before: Sequence[ViewScore], after: Sequence[ViewScore]) -> list[tuple[int, str]]:
     """Return the views whose PSNR fell by over `LOST`, most first, with a text on each.
 
-    >>> rows = [ViewScore(name, 30.0) for name in "ab"]
-    >>> _find_worsened(rows, [ViewScore("a", 31.0), ViewScore("b", 29.0)])
+    >>> rows = [ViewScore(30.0, name=name) for name in "ab"]
+    >>> _find_worsened(rows, [ViewScore(31.0, name="a"), ViewScore(29.0, name="b")])
     [(1, 'b 30.00 → 29.00 dB')]
     """
     falls = [old.psnr - new.psnr for old, new in zip(before, after, strict=True)]

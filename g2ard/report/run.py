@@ -10,9 +10,10 @@ from typing import Any
 
 from g2ard.io.reports import LEFT_OUT, Report
 from g2ard.progress import plural
+from g2ard.rendering.metrics import METRICS
 from g2ard.report.labels import RESULT
 from g2ard.scene.cameras import USUAL, rows_by_kind
-from g2ard.stages.evaluate import Evaluation, Means, ViewScore
+from g2ard.stages.evaluate import Evaluation, Means, Scores, ViewScore
 from g2ard.stages.recover.anchors import PriorMeasures
 from g2ard.stages.recover.report import RecoverReport
 from g2ard.stages.simplify.reduce import SimplifyReport
@@ -41,23 +42,36 @@ class KindScore(Report):
     Args:
         kind: near, standing, anywhere or another kind that views state; otherwise `usual` for generated
             views and `given` for the user's.
-        ssim: mean SSIM; None if it was not measured.
+        before: mean scores of the simplified scene.
+        after: those of the recovered one.
         worst: name of the view with the lowest PSNR after recovery.
         worst_psnr: PSNR of that view, dB.
         lost: number of views that lost over 0.05 dB.
-        edge_psnr: mean PSNR of gradients, dB; None if it was not measured.
-        detail: mean correlation of gradients; None for a scene in tiles.
     """
 
     kind: str
     views: int
-    psnr: Change
-    ssim: Change | None
+    before: Scores
+    after: Scores
     worst: str
     worst_psnr: Change
     lost: int
-    edge_psnr: Change | None = None
-    detail: Change | None = None
+
+    @property
+    def psnr(self) -> Change:
+        """Mean PSNR, dB."""
+        return Change(self.before.psnr, self.after.psnr)
+
+    def change(self, score: str) -> Change | None:
+        """Return a mean score of both scenes; None if it was not measured."""
+        before, after = (scores.scores[score] for scores in (self.before, self.after))
+        return None if math.isnan(after) else Change(before, after)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the report as JSON values, with one change per score."""
+        own = {name: value for name, value in super().as_dict().items() if name not in ("before", "after")}
+        changes = {name: self.change(name) for name in self.after.scores}
+        return own | {name: change and change.as_dict() for name, change in changes.items()}
 
 
 def summarize_by_kind(
@@ -65,40 +79,27 @@ def summarize_by_kind(
 ) -> tuple[KindScore, ...]:
     """Summarise scores of views before and after recovery by kind of view; `usual` names the usual kind.
 
-    >>> before, after = (ViewScore("near_0000", psnr, kind="near") for psnr in (30.0, 31.0))
+    >>> before, after = (ViewScore(psnr, name="near_0000", kind="near") for psnr in (30.0, 31.0))
     >>> found, = summarize_by_kind([before], [after])
-    >>> found.kind, found.psnr.gain, found.ssim, found.worst
+    >>> found.kind, found.psnr.gain, found.change("ssim"), found.worst
     ('near', 1.0, None, 'near_0000')
     """
-
-    def changes(score: str, rows: Sequence[int]) -> list[Change]:
-        return [Change(getattr(before[row], score), getattr(after[row], score)) for row in rows]
-
-    def mean_if_scored(score: str, rows: Sequence[int]) -> Change | None:
-        found = mean(changes(score, rows))
-        return None if math.isnan(found.after) else found
-
-    def mean(found: Sequence[Change]) -> Change:
-        return Change(fmean(change.before for change in found), fmean(change.after for change in found))
-
-    scores = []
+    summaries = []
     for kind, rows in rows_by_kind([view.kind for view in after]).items():
-        psnr = changes("psnr", rows)
-        worst = min(range(len(rows)), key=lambda i: psnr[i].after)
-        scores.append(
+        changes = [Change(before[row].psnr, after[row].psnr) for row in rows]
+        worst = min(range(len(rows)), key=lambda i: changes[i].after)
+        summaries.append(
             KindScore(
                 usual if kind == USUAL else kind,
                 len(rows),
-                mean(psnr),
-                mean_if_scored("ssim", rows),
+                Scores.mean([before[row] for row in rows], fmean),
+                Scores.mean([after[row] for row in rows], fmean),
                 after[rows[worst]].name,
-                psnr[worst],
-                sum(change.gain < -LOST for change in psnr),
-                mean_if_scored("edge_psnr", rows),
-                mean_if_scored("detail", rows),
+                changes[worst],
+                sum(change.gain < -LOST for change in changes),
             )
         )
-    return tuple(scores)
+    return tuple(summaries)
 
 
 COLUMNS = ("kind of view", "views", "PSNR, dB", "worst", "detail", "SSIM")
@@ -107,16 +108,20 @@ COLUMNS = ("kind of view", "views", "PSNR, dB", "worst", "detail", "SSIM")
 def list_cells(kinds: Iterable[KindScore]) -> list[list[str]]:
     """Return the rows of a table with `COLUMNS`."""
     return [
-        [
-            kind.kind,
-            str(kind.views),
-            f"{kind.psnr.before:.2f} → {kind.psnr.after:.2f}",
-            f"{kind.worst_psnr.after:.2f}",
-            f"{kind.detail.before:.2f} → {kind.detail.after:.2f}" if kind.detail else "–",
-            f"{kind.ssim.before:.4f} → {kind.ssim.after:.4f}" if kind.ssim else "–",
-        ]
+        [kind.kind, str(kind.views), *_list_scores(kind.before, kind.after, f"{kind.worst_psnr.after:.2f}")]
         for kind in kinds
     ]
+
+
+def _list_scores(before: Scores, after: Scores, worst: str) -> list[str]:
+    """Return the cells of `COLUMNS` from PSNR on."""
+    psnr, detail, ssim = (
+        "–"
+        if math.isnan(after.scores[name])
+        else " → ".join(f"{scores.scores[name]:.{METRICS[name].digits}f}" for scores in (before, after))
+        for name in ("psnr", "detail", "ssim")
+    )
+    return [psnr, worst, detail, ssim]
 
 
 def list_rows(report: RunReport) -> list[list[str]]:
@@ -124,14 +129,7 @@ def list_rows(report: RunReport) -> list[list[str]]:
     if report.own_size is None:
         return list_cells(report.kinds)
     before, after = (report.own_size[name] for name in ("simplified", "recovered"))
-    first = [
-        "full size",
-        after.scored_in.split()[0],
-        f"{before.psnr:.2f} → {after.psnr:.2f}",
-        "–",
-        "–" if math.isnan(after.detail) else f"{before.detail:.2f} → {after.detail:.2f}",
-        f"{before.ssim:.4f} → {after.ssim:.4f}",
-    ]
+    first = ["full size", after.scored_in.split()[0], *_list_scores(before, after, "–")]
     return [first, *list_cells(report.kinds)]
 
 

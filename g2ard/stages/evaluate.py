@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,7 @@ from g2ard.io.images import as_saved
 from g2ard.io.reports import Report
 from g2ard.progress import Progress, plural, silent
 from g2ard.rendering.exposure import rendered
-from g2ard.rendering.metrics import Lpips, detail, edge_psnr, lost_detail, psnr, ssim
+from g2ard.rendering.metrics import METRICS, Lpips, lost_detail
 from g2ard.rendering.renderer import RasterSettings, Renderer
 from g2ard.rendering.targets import Targets, against_of, checked_targets, fill, mask_of, scored_in
 from g2ard.scene.cameras import USUAL
@@ -26,19 +26,47 @@ from g2ard.system.threads import in_threads
 
 
 @dataclass(frozen=True)
-class ViewScore:
-    """Scores of one view: PSNR and that of gradients in dB, SSIM and the correlation of gradients in [−1, 1],
-    LPIPS by network (empty without weights), visibility of lost detail; NaN where not measured.
+class Scores(Report):
+    """Scores by `g2ard.rendering.metrics.METRICS`, of a view or means over views; NaN where not measured.
 
-    `against` is "photo" or "teacher" if the targets say so, `kind` the kind of view (`Cameras.kinds`),
-    `size` the width and height of the images in pixels.
+    Args:
+        psnr: PSNR, dB.
+        ssim: SSIM, in [−1, 1].
+        edge_psnr: PSNR of gradients, dB.
+        detail: correlation of gradients, in [−1, 1].
     """
 
-    name: str
     psnr: float
     ssim: float = math.nan
     edge_psnr: float = math.nan
     detail: float = math.nan
+
+    @property
+    def scores(self) -> dict[str, float]:
+        """Scores by name."""
+        return {name: getattr(self, name) for name in METRICS}
+
+    @classmethod
+    def mean(cls, scores: Sequence[Scores], average: Callable[[Any], Any] = np.mean, **further: Any) -> Self:
+        """Return the means of several scores, with further fields."""
+        means = {name: float(average([getattr(each, name) for each in scores])) for name in METRICS}
+        return cls(**means, **further)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ViewScore(Scores):
+    """Scores of one view.
+
+    Args:
+        name: the view's name.
+        lpips: LPIPS by network; empty without weights.
+        against: "photo" or "teacher" if the targets say so.
+        kind: kind of view (`Cameras.kinds`).
+        size: width and height of the images in pixels.
+        lost: visibility of the detail that the worst regions lack.
+    """
+
+    name: str
     lpips: Mapping[str, float] = field(default_factory=dict)
     against: str | None = None
     kind: str = USUAL
@@ -46,56 +74,34 @@ class ViewScore:
     lost: float = math.nan
 
 
-@dataclass(frozen=True)
-class Means(Report):
-    """Mean scores over views, and number, kind and size of these."""
+@dataclass(frozen=True, kw_only=True)
+class Means(Scores):
+    """Mean scores over views.
 
-    psnr: float
-    ssim: float
-    edge_psnr: float
-    detail: float
+    Args:
+        scored_in: number, kind and size of the views, such as "7 photos, 800×600 px".
+    """
+
     scored_in: str
 
 
-@dataclass(frozen=True)
-class Evaluation(Report):
-    """Scores of a scene over a set of views.
+@dataclass(frozen=True, kw_only=True)
+class Evaluation(Means):
+    """Scores of a scene, means over a set of views.
 
     Args:
         count: number of Gaussians.
         bytes: size as float32 arrays, as in a .ply.
         views: one score per view, in camera order.
-        scored_in: number, kind and size of the views, such as "7 photos, 800×600 px".
     """
 
     count: int
     bytes: int
     views: tuple[ViewScore, ...]
-    scored_in: str
 
     def __repr__(self) -> str:
         scores = f"PSNR {self.psnr:.2f} dB, SSIM {self.ssim:.4f}"
         return f"Evaluation({plural(self.count, 'Gaussian')}, {self.scored_in}: {scores})"
-
-    @property
-    def psnr(self) -> float:
-        """Mean of the views' PSNR, in dB."""
-        return float(np.mean([v.psnr for v in self.views]))
-
-    @property
-    def ssim(self) -> float:
-        """Mean of the views' SSIM."""
-        return float(np.mean([v.ssim for v in self.views]))
-
-    @property
-    def edge_psnr(self) -> float:
-        """Mean of the views' PSNR of gradients, in dB."""
-        return float(np.mean([v.edge_psnr for v in self.views]))
-
-    @property
-    def detail(self) -> float:
-        """Mean of the views' correlation of gradients."""
-        return float(np.mean([v.detail for v in self.views]))
 
     @property
     def lpips(self) -> dict[str, float]:
@@ -105,29 +111,18 @@ class Evaluation(Report):
     @property
     def means(self) -> Means:
         """Means of the scores, and where they were measured."""
-        return Means(self.psnr, self.ssim, self.edge_psnr, self.detail, self.scored_in)
+        return Means(**self.scores, scored_in=self.scored_in)
 
     def as_dict(self) -> dict[str, Any]:
         """Return the content of `g2ard evaluate --json`."""
         return {
             "count": self.count,
             "bytes": self.bytes,
-            "psnr": self.psnr,
-            "ssim": self.ssim,
-            "edge_psnr": self.edge_psnr,
-            "detail": self.detail,
+            **self.scores,
             "lpips": self.lpips or None,
             "scored_in": self.scored_in,
             "views": [
-                {
-                    "name": v.name,
-                    "size": list(v.size),
-                    "psnr": v.psnr,
-                    "ssim": v.ssim,
-                    "edge_psnr": v.edge_psnr,
-                    "detail": v.detail,
-                    "lost": v.lost,
-                }
+                {"name": v.name, "size": list(v.size), **v.scores, "lost": v.lost}
                 | ({"against": v.against} if v.against else {})
                 | ({"kind": v.kind} if v.kind != USUAL else {})
                 for v in self.views
@@ -202,16 +197,13 @@ def evaluate(
         if mask is not None and not mask.any():
             raise InputError(f"({name}) has no valid pixel", index=view, item="view")
         found = ViewScore(
-            name,
-            psnr(image, target, mask),
-            ssim(image, target, mask),
-            edge_psnr(image, target, mask),
-            detail(image, target, mask),
-            perceived,
-            against_of(targets, view),
-            cameras.kinds[view],
-            (int(cameras.widths[view]), int(cameras.heights[view])),
-            lost_detail(image, target, mask),
+            **{score: metric.measure(image, target, mask) for score, metric in METRICS.items()},
+            name=name,
+            lpips=perceived,
+            against=against_of(targets, view),
+            kind=cameras.kinds[view],
+            size=(int(cameras.widths[view]), int(cameras.heights[view])),
+            lost=lost_detail(image, target, mask),
         )
         return found, None if watch is None else image
 
@@ -222,4 +214,7 @@ def evaluate(
         if watch is not None and image is not None:
             watch(view, done, image)
         progress(stage, len(scores), len(cameras))
-    return Evaluation(len(splats), splats.nbytes, tuple(scores), scored_in(targets))
+    where = scored_in(targets)
+    return Evaluation.mean(
+        scores, count=len(splats), bytes=splats.nbytes, views=tuple(scores), scored_in=where
+    )

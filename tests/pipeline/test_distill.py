@@ -113,7 +113,7 @@ def test_a_loss_in_any_kind_of_view_is_reported() -> None:
         before, after = [], []
         for kind, gain in (("usual", usual), ("near", near)):
             for i, share in enumerate((2.5, -0.5) if gain is not None else ()):
-                view = ViewScore(f"{kind}_{i}", 30.0, 0.9, kind=kind)
+                view = ViewScore(30.0, 0.9, name=f"{kind}_{i}", kind=kind)
                 before.append(view)
                 after.append(replace(view, psnr=30.0 + share * gain, ssim=0.9 + ssim))
         found = {"rounds": (), "kinds": summarize_by_kind(before, after), "unseen": unseen}
@@ -126,8 +126,8 @@ def test_a_loss_in_any_kind_of_view_is_reported() -> None:
     mixed = said(0.3, 0.3, 0.0, ssim=-0.004)[0]
     assert mixed == "recovery lost 0.004 SSIM and gained 0.30 dB in usual views"
     assert said(0.0, None, 0.0, ssim=-0.004)[0].startswith("warning: recovery lost 0.004 SSIM")
-    before = [ViewScore("a", 15.0), ViewScore("b", 30.0)]
-    line = describe_loss(summarize_by_kind(before, [ViewScore("a", 15.5), ViewScore("b", 29.0)])[0])
+    before = [ViewScore(15.0, name="a"), ViewScore(30.0, name="b")]
+    line = describe_loss(summarize_by_kind(before, [ViewScore(15.5, name="a"), ViewScore(29.0, name="b")])[0])
     assert "recovery lost 0.25 dB in usual views (1 of 2 views lost PSNR)" in line  # the worst view gained
     lines = said(-0.2, -0.3, 0.25)
     assert "lost 0.20 dB in usual views" in lines[0]

@@ -27,10 +27,12 @@ def rungs(*scores: tuple[float, float], against: str = "teacher") -> list[Rung]:
     found = []
     for i, pair in enumerate(scores):
         views = tuple(
-            ViewScore(name, v, against=against) if against == "photo" else ViewScore(name, 40 - v, lost=v)
+            ViewScore(v, name=name, against=against)
+            if against == "photo"
+            else ViewScore(40 - v, name=name, lost=v)
             for name, v in zip("ab", pair, strict=True)
         )
-        result = Evaluation(10 * 2**i, 1, views, "2 views")
+        result = Evaluation.mean(views, count=10 * 2**i, bytes=1, views=views, scored_in="2 views")
         found.append(Rung(f"{i}.ply", f"{40 / 2**i:g}×", 100 * 2**i, BALL, result))
     return found
 

@@ -29,7 +29,7 @@ def test_distill_writes_a_report(command_line: CommandLine, tmp_path: Path) -> N
 
 
 VIEWS = [
-    ViewScore(name, psnr, 0.9, kind="near" if "near" in name else "usual")
+    ViewScore(psnr, 0.9, name=name, kind="near" if "near" in name else "usual")
     for name, psnr in zip(
         ("pose_0", "pose_1", "near_0", "near_1", "near_2"), (38, 30, 29, 25, 27), strict=True
     )
@@ -53,7 +53,7 @@ def test_the_verdict_names_the_weakest_kind_of_view() -> None:
     assert summarize_run(replace(report, kinds=())) == "9 Gaussians; no held-out view shows the scene."
     of_photos = summarize_run(replace(report, lifted=True, against="photos"))
     assert of_photos.startswith("9 Gaussians from 90 points reproduce the photos at")
-    full = Means(26.04, 0.8, 30, 0.9, "5 photos, 96×72 px")
+    full = Means(26.04, 0.8, 30, 0.9, scored_in="5 photos, 96×72 px")
     told = summarize_run(replace(report, own_size={"recovered": full}))
     assert "at 26.0 dB in 5 photos, 96×72 px, the views' own size; at 29.8 dB, the mean of 5" in told
     sizes = {"simplified": replace(full, psnr=24.5), "recovered": full}

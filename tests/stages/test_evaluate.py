@@ -1,6 +1,7 @@
 """Evaluators as other people's: INRIA's conventions, 8-bit renders, unscaled LPIPS, mixed targets."""
 
 import json
+from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
@@ -10,10 +11,10 @@ from PIL import Image
 from g2ard import io
 from g2ard.errors import InputError
 from g2ard.io.images import as_saved, write_png
-from g2ard.rendering.metrics import Lpips, psnr
+from g2ard.rendering.metrics import METRICS, Lpips, psnr
 from g2ard.rendering.renderer import RasterSettings, render
 from g2ard.rendering.targets import PhotosOrRenders, TeacherRenders
-from g2ard.stages.evaluate import evaluate
+from g2ard.stages.evaluate import Scores, evaluate
 from helpers.commands import CommandLine, refused, succeeds
 from helpers.lpips_weights import weights
 from helpers.photos import rgba_photos_of
@@ -74,6 +75,16 @@ def test_each_view_has_its_photo_or_the_teachers_render(tmp_path: Path) -> None:
     assert np.array_equal(only[3], rendered[3])
     with pytest.raises(InputError, match="exposure of view_000"):
         PhotosOrRenders(views, ball, exposures={"view_000": np.zeros((3, 4))})
+
+
+def test_every_metric_has_a_field_and_a_column(command_line: CommandLine, folder: Path) -> None:
+    assert [field.name for field in fields(Scores)] == [*METRICS]
+    of = ("--views", "views.json", "--teacher", "ball.ply", "--size", 24)
+    done = succeeds(command_line, folder, "evaluate", "ball.ply", *of, "--json", "found.json")
+    (scene,) = json.loads((folder / "found.json").read_text())["scenes"]
+    for name, metric in METRICS.items():
+        assert {name} <= {*scene} & {*scene["views"][0]}
+        assert metric.heading in done.out
 
 
 def test_reports_state_file_sizes(command_line: CommandLine, folder: Path) -> None:

@@ -276,14 +276,13 @@ def _describe_own_size(names: list[str], rows: list[dict[str, Any]]) -> str:
 
 
 def _print_table(run: Run, title: str, rows: list[dict[str, Any]]) -> None:
+    from g2ard.rendering.metrics import METRICS
+
     columns = {
         "scene": name_scenes([Path(r["scene"]) for r in rows]),
         "Gaussians": [f"{r['count']:,}" for r in rows],
         "MB": [f"{r['file_bytes'] / 1e6:.2f}" for r in rows],
-        "PSNR": [f"{r['psnr']:.2f}" for r in rows],
-        "SSIM": [f"{r['ssim']:.4f}" for r in rows],
-        "edges": [f"{r['edge_psnr']:.2f}" for r in rows],
-        "detail": [f"{r['detail']:.2f}" for r in rows],
+        **{m.heading: [f"{r[name]:.{m.digits}f}" for r in rows] for name, m in METRICS.items()},
         "needles": [f"{r['needle']:.1%}" for r in rows],
         "overdraw": [f"{r['overdraw']:.1f}" for r in rows],
     }
@@ -293,8 +292,5 @@ def _print_table(run: Run, title: str, rows: list[dict[str, Any]]) -> None:
         columns["Drift95"] = [f"{r['drift95']:.3g}" for r in rows]
     cells = [list(row) for row in zip(*columns.values(), strict=True)]
     run.console.table(title, list(columns), cells, stdout=run.json != "-")
-    run.say(
-        "PSNR in dB; edges: PSNR of the images' gradients, in dB; detail: their correlation, at most 1; "
-        "needles: share of long, thin Gaussians; "
-        "overdraw: Gaussians blended per pixel"
-    )
+    further = ["needles: share of long, thin Gaussians", "overdraw: Gaussians blended per pixel"]
+    run.say("; ".join([*(m.legend for m in METRICS.values() if m.legend), *further]))
