@@ -59,26 +59,32 @@ def _image(cameras: Cameras, index: int) -> Float32:
     if path is None:
         raise InputError(f"({name}) has no photo", index=index, item="view", hint="pass views with photos")
     named = None if cameras.source is None else f"{cameras.source} names it as view {name!r}"
+    target = int(cameras.widths[index]), int(cameras.heights[index])
+    lens = _lens_of(cameras, index)
+    size = target if lens is None else lens.size
     try:
-        target = int(cameras.widths[index]), int(cameras.heights[index])
-        lens = cameras.lenses[index]
-        image = decode_photo(path, target) if lens is None else _opened(path, _modified(path), lens.size)
+        several = cameras.lenses[index] is not None  # views of one photo, which follow each other
+        image = _opened(path, _modified(path), size) if several else decode_photo(path, size)
     except InputError as error:
         raise error.at(hint="; ".join(filter(None, (error.hint, named))) or None) from error
     height, width = image.shape[:2]
-    if lens is not None and fits((width, height), lens.size):
-        return _through(image, lens, cameras.Ks[index], target)
-    if not fits((width, height), target if lens is None else lens.size):
+    if not fits((width, height), size):
         raise InputError(
             f"the photo is {width}×{height}, its view {target[0]}×{target[1]}: the aspects differ",
             path=path,
             hint="pass the uncropped photos that the poses were estimated from",
         )
-    distortion = cameras.distortions[index]
-    if distortion.any():
-        K = cameras.Ks[index] * np.array([[width / target[0]], [height / target[1]], [1.0]])
-        image = _undistorted(image, K, distortion)
-    return resized(image, target)
+    return resized(image, target) if lens is None else _through(image, lens, cameras.Ks[index], target)
+
+
+def _lens_of(cameras: Cameras, index: int) -> PhotoLens | None:
+    """Return the lens of a view's photo; None for a pinhole."""
+    k1, k2, p1, p2, k3 = cameras.distortions[index].tolist()
+    if cameras.lenses[index] is not None or not any((k1, k2, p1, p2, k3)):
+        return cameras.lenses[index]
+    (fx, _, cx), (_, fy, cy), _ = cameras.Ks[index].tolist()
+    size = int(cameras.widths[index]), int(cameras.heights[index])
+    return PhotoLens("FULL_OPENCV", size, (fx, fy, cx, cy, k1, k2, p1, p2, k3, 0.0, 0.0, 0.0))
 
 
 @dataclass(frozen=True)
@@ -162,39 +168,15 @@ def _kept(mask: Float32) -> Mask:
 
 def _held(cameras: Cameras, index: int) -> Mask | None:
     """Return the pixels of a view that its undistorted photo holds in full, or None if all are."""
-    photo, distortion, lens = cameras.image_paths[index], cameras.distortions[index], cameras.lenses[index]
-    if photo is None or (lens is None and not distortion.any()):
+    photo = cameras.image_paths[index]
+    lens = _lens_of(cameras, index)
+    if photo is None or lens is None:
         return None
-    target = int(cameras.widths[index]), int(cameras.heights[index])
-    width, height = photo_size(photo, cameras.source, target if lens is None else lens.size)
-    if lens is not None:
-        times = _samples(lens, width, cameras.Ks[index])
-        samples = _lens_lookup(lens, tuple(cameras.Ks[index].ravel()), target, times)[1]
-        whole: Mask = np.all(samples.reshape(target[1], times, target[0], times), axis=(1, 3))
-        return None if whole.all() else whole
-    K = cameras.Ks[index] * np.array([[width / target[0]], [height / target[1]], [1.0]])
-    held = _held_at(width, height, tuple(K.ravel()), tuple(distortion), target)
-    return None if held.all() else held
-
-
-@lru_cache(maxsize=2)
-def _held_at(
-    width: int, height: int, K: tuple[float, ...], distortion: tuple[float, ...], target: Size
-) -> Mask:
-    held = _lookup(width, height, K, distortion)[-1].reshape(height, width, 1)
-    found = resized(held.astype(np.float32), target)[..., 0] > _WHOLE
-    found.flags.writeable = False
-    return found
-
-
-_WHOLE = 0.999  # share of a pixel above which it counts as whole
-
-
-def _undistorted(image: Float32, K: Float, distortion: Float) -> Float32:
-    """Sample the distorted photo for each pixel of the pinhole image."""
-    height, width = image.shape[:2]
-    u, v, _ = _lookup(width, height, tuple(K.ravel()), tuple(distortion))
-    return _sampled(image, u, v).reshape(image.shape)
+    size = int(cameras.widths[index]), int(cameras.heights[index])
+    times = _samples(lens, photo_size(photo, cameras.source, lens.size)[0], cameras.Ks[index])
+    samples = _lookup(lens, cameras.Ks[index], size, times)[1]
+    whole: Mask = np.all(samples.reshape(size[1], times, size[0], times), axis=(1, 3))
+    return None if whole.all() else whole
 
 
 def _sampled(image: Float32, u: Float, v: Float, around: bool = False) -> Float32:
@@ -212,32 +194,6 @@ def _sampled(image: Float32, u: Float, v: Float, around: bool = False) -> Float3
         for row in (above, np.minimum(above + 1, height - 1))
     )
     return np.asarray(top * (1 - down) + bottom * down)
-
-
-@lru_cache(maxsize=2)  # usually all photos share one lens
-def _lookup(
-    width: int, height: int, K: tuple[float, ...], distortion: tuple[float, ...]
-) -> tuple[Float, Float, Mask]:
-    """Return column and row of each pixel's source, and whether the photo holds it.
-
-    OpenCV's model, pixel centres at +0.5:
-
-    x' = x·(1 + k1 r² + k2 r⁴ + k3 r⁶) + 2 p1 x y + p2 (r² + 2 x²), y' likewise with p1 and p2 exchanged.
-    """
-    k1, k2, p1, p2, k3 = distortion
-    matrix = np.array(K).reshape(3, 3)
-    v, u = np.mgrid[0:height, 0:width] + 0.5
-    x, y, _ = np.linalg.inv(matrix) @ np.stack([u.ravel(), v.ravel(), np.ones(u.size)])
-    r2 = x * x + y * y
-    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    bent = [
-        x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
-        y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
-        np.ones_like(x),
-    ]
-    u, v = matrix[:2] @ bent - 0.5
-    held = (u >= -0.5) & (u <= width - 0.5) & (v >= -0.5) & (v <= height - 0.5) & (r2 < _fold(k1, k2, k3))
-    return u, v, held
 
 
 def _modified(path: Path) -> int | None:
@@ -258,7 +214,7 @@ def _through(image: Float32, lens: PhotoLens, K: Float, size: Size) -> Float32:
     as the photo is finer, which are averaged."""
     height, width = image.shape[:2]
     times = _samples(lens, width, K)
-    pixels, _ = _lens_lookup(lens, tuple(K.ravel()), size, times)
+    pixels, _ = _lookup(lens, K, size, times)
     u, v = (pixels * (np.array([width, height]) / lens.size) - 0.5).T
     samples = _sampled(image, u, v, around=lens.model == "EQUIRECTANGULAR")
     return resized(samples.reshape(size[1] * times, size[0] * times, -1), size)
@@ -273,15 +229,17 @@ def _samples(lens: PhotoLens, width: int, K: Float) -> int:
     return int(np.clip(np.ceil(finer - 0.01), 1, _MOST_SAMPLES))
 
 
-@lru_cache(maxsize=6)  # the faces of a cube
-def _lens_lookup(lens: PhotoLens, K: tuple[float, ...], size: Size, times: int) -> tuple[Float, Mask]:
+def _lookup(lens: PhotoLens, K: Float, size: Size, times: int) -> tuple[Float, Mask]:
     """Return the pixel of a lens for each sample of a pinhole view, and whether its photo holds it."""
+    keep = _lookup_of_view if lens.model == "FULL_OPENCV" else _lookup_of_face
+    return keep(lens, tuple(K.ravel()), size, times)
+
+
+def _find_pixels(lens: PhotoLens, K: tuple[float, ...], size: Size, times: int) -> tuple[Float, Mask]:
     v, u = (np.mgrid[0 : size[1] * times, 0 : size[0] * times] + 0.5) / times
     rays = np.stack([u.ravel(), v.ravel(), np.ones(u.size)], 1) @ np.linalg.inv(np.array(K).reshape(3, 3)).T
     return lens.project(rays)
 
 
-def _fold(k1: float, k2: float, k3: float) -> float:
-    """Return r² where r·(1 + k1 r² + k2 r⁴ + k3 r⁶) stops growing, where the lens model ends."""
-    roots = np.roots([7 * k3, 5 * k2, 3 * k1, 1])
-    return min((root.real for root in roots if abs(root.imag) < 1e-9 and root.real > 0), default=np.inf)
+_lookup_of_view = lru_cache(maxsize=2)(_find_pixels)  # usually all photos share one lens
+_lookup_of_face = lru_cache(maxsize=6)(_find_pixels)  # as many as a cube has
