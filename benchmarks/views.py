@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from g2ard import _core, io
+import g2ard._core as _core
+from g2ard import io
 from g2ard.config.choices import Colour
 from g2ard.errors import InputError
 from g2ard.io.splits import for_scores
