@@ -164,8 +164,7 @@ def read_points(path: str | Path) -> Points:
     """Read a coloured point cloud.
 
     Args:
-        path: .ply with x y z red green blue, .las, .laz, .e57, COLMAP's points3D.bin or .txt, or a COLMAP
-            folder.
+        path: a file of any format in `g2ard.io.detect.READERS`, or a COLMAP folder.
 
     Returns:
         Positions in float64, world units; colours in [0, 1].
