@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from g2ard.io.colmap import parsing
-from g2ard.io.frames import Frame, Lens, Listed, posed, view_set
-from g2ard.io.photo_headers import photo_size
+from g2ard.io.frames import Frame, Lens, Listed, make_pose, make_view_set
+from g2ard.io.photo_headers import read_size
 from g2ard.io.types import Float, ViewSet
 
 __all__ = ["read"]
@@ -44,11 +44,11 @@ def read(folder: Path) -> ViewSet:
                 own = Lens.pinhole((width, height), (focal, focal), distortion=distortion)
                 frames.append(Frame(name, viewmat, own, folder / name, split, listed=name))
     text = f"{guessed} views are not in {model.name}; they get the median focal length, {median:.1f}"
-    return view_set(Listed(folder, frames).noted("guessed_focal", guessed, text))
+    return make_view_set(Listed(folder, frames).noted("guessed_focal", guessed, text))
 
 
 def _size(photo: Path) -> tuple[int, int]:
-    return photo_size(photo) if photo.is_file() else _PHOTO_SIZE
+    return read_size(photo) if photo.is_file() else _PHOTO_SIZE
 
 
 def _stem(name: str) -> str:
@@ -63,7 +63,7 @@ def _poses(path: Path) -> Iterator[tuple[str, Float]]:
         if not words:
             continue
         numbers = np.array(words[1:8], np.float64)
-        viewmat = posed(numbers[3:], (0, 0, 0))
+        viewmat = make_pose(numbers[3:], (0, 0, 0))
         viewmat[:3, 3] = -viewmat[:3, :3] @ numbers[:3]
         yield words[0], viewmat
 

@@ -37,7 +37,7 @@ def write_animation(
     check_animation(path)
     shown = iter(pictures)
     first = next(shown)
-    frames = _of_size(path, first.shape, itertools.chain([first], shown))
+    frames = _check_sizes(path, first.shape, itertools.chain([first], shown))
     with atomic_output(path, overwrite) as temporary:
         if path.suffix.lower() == ".mp4":
             _encode(temporary, (first.shape[1], first.shape[0]), frames, fps)
@@ -47,7 +47,7 @@ def write_animation(
         image.save(temporary, save_all=True, append_images=rest, **options)
 
 
-def _of_size(path: Path, shape: tuple[int, ...], frames: Iterable[Bytes]) -> Iterator[Bytes]:
+def _check_sizes(path: Path, shape: tuple[int, ...], frames: Iterable[Bytes]) -> Iterator[Bytes]:
     for frame in frames:
         if frame.shape != shape:
             sizes = " and ".join(f"{width}×{height}" for height, width, _ in (shape, frame.shape))

@@ -15,7 +15,7 @@ import numpy as np
 
 from g2ard.errors import InputError, damaged
 from g2ard.io.finding import Finder, files_in
-from g2ard.io.frames import Frame, Lens, Listed, posed
+from g2ard.io.frames import Frame, Lens, Listed, make_pose
 from g2ard.io.jsonfile import Place
 from g2ard.io.paths import about, read_text
 from g2ard.io.transforms import intrinsics_of
@@ -216,7 +216,7 @@ def listed(views: ViewFiles) -> Listed:
         if isinstance(camera, InputError):
             faults.append((name, camera))
             continue
-        pose = posed(own[:4], own[4:]) if fault is None and any(own[:4]) else None
+        pose = make_pose(own[:4], own[4:]) if fault is None and any(own[:4]) else None
         in_rig = by_rig.get((key, number))
         if in_rig is not None and (pose is None or not np.allclose(in_rig, pose, rtol=_SAME, atol=_SAME)):
             stale += pose is not None
@@ -500,7 +500,7 @@ def _known(numbers: Sequence[float]) -> Float | None:
     """Return the rigid transform of seven numbers, or None if it is not one."""
     if not all(map(math.isfinite, numbers)) or not any(numbers[:4]):
         return None
-    return posed(numbers[:4], numbers[4:])
+    return make_pose(numbers[:4], numbers[4:])
 
 
 def texts_of(cameras: Cameras) -> dict[str, str]:

@@ -11,7 +11,7 @@ from g2ard.config.choices import colour_text
 from g2ard.io import Source, read_view_set
 from g2ard.io.detect import run_scene
 from g2ard.io.jsonfile import Json
-from g2ard.io.photos import photo_traits
+from g2ard.io.photos import measure_traits
 from g2ard.io.sog import chunks_of
 from g2ard.io.splits import splits_of
 from g2ard.io.types import Note, Points, Values, ViewFiles, ViewSet
@@ -132,7 +132,7 @@ def _views(views: ViewSet) -> Json:
 
 def _photo_notes(cameras: Cameras) -> list[Note]:
     photos = [photo for photo in cameras.image_paths if photo is not None]
-    traits = photo_traits(photos)
+    traits = measure_traits(photos)
     notes = []
     if traits.alpha:
         text = f"{plural(traits.alpha, 'photo')} of {len(photos)} have alpha (see --background and --alpha)"

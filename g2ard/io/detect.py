@@ -388,7 +388,7 @@ _NO_FOLDER = "is not a supported folder"
 def _unsupported(path: Path) -> str:
     """Say what a folder holds instead of one thing that can be read, and what to give."""
     from g2ard.io.colmap import models_below
-    from g2ard.io.photo_headers import unreadable
+    from g2ard.io.photo_headers import describe_unreadable
 
     held: dict[Kind, list[str]] = {"splats": [], "points": [], "views": []}
     files = (
@@ -416,7 +416,7 @@ def _unsupported(path: Path) -> str:
             continue
         if (poses := _poses_above(path)) is not None:
             return f"holds photos alone; give {poses}, which has their poses"
-        unread = [what for file in photos[:_MOST_INSPECTED_FILES] if (what := unreadable(file))]
+        unread = [what for file in photos[:_MOST_INSPECTED_FILES] if (what := describe_unreadable(file))]
         first = f"convert its {unread[0]} photos to JPEG, then " if unread else ""
         return (
             f"holds photos without poses: {first}estimate them with `colmap automatic_reconstructor "

@@ -13,7 +13,7 @@ import numpy as np
 
 from g2ard.errors import G2ardError, InputError, missing
 from g2ard.io.atomic import atomic_output
-from g2ard.io.frames import Frame, Lens, Listed, inverse, posed
+from g2ard.io.frames import Frame, Lens, Listed, invert_pose, make_pose
 from g2ard.io.judge import full_scales
 from g2ard.io.paths import check_unpacked, file_identity, user_cache
 from g2ard.io.stream import JoinedClouds, MarkedPoints, Names, PointStream, telling
@@ -259,7 +259,7 @@ def _frame(number: int, node: Any, folder: Path) -> Frame | str:
         else None
     )
     world_from_camera = _pose(node["pose"]) @ (_PANORAMA_AXES if kind == "spherical" else FLIP)
-    return Frame(photo.name, inverse(world_from_camera), lens, photo, mask=mask, listed=photo.name)
+    return Frame(photo.name, invert_pose(world_from_camera), lens, photo, mask=mask, listed=photo.name)
 
 
 def _pose(node: Any) -> Float:
@@ -269,7 +269,7 @@ def _pose(node: Any) -> Float:
         quat = [float(node["rotation"][axis].value()) for axis in "wxyz"]
     if node.isDefined("translation"):
         shift = [float(node["translation"][axis].value()) for axis in "xyz"]
-    return posed(quat, shift)
+    return make_pose(quat, shift)
 
 
 def _copied(blob: Any, target: Path) -> Path:

@@ -24,7 +24,15 @@ from g2ard.io.finding import (
     usable,
 )
 from g2ard.io.jsonfile import Place
-from g2ard.io.photo_headers import fits, has_alpha, opened_image, orientation, turned, turns, unreadable
+from g2ard.io.photo_headers import (
+    describe_unreadable,
+    has_alpha,
+    have_same_aspect,
+    needs_turn,
+    open_image,
+    orientation,
+    swap_sides,
+)
 from g2ard.io.types import Float, Note, Notes, Size, ViewSet
 from g2ard.progress import plural
 from g2ard.scene.cameras import USUAL, Cameras
@@ -65,7 +73,7 @@ class Lens(NamedTuple):
 
     @classmethod
     def of(cls, photo: PhotoLens) -> Lens:
-        """Return the lens of a photo, from which `view_set` makes views."""
+        """Return the lens of a photo, from which `make_view_set` makes views."""
         return cls(photo.size, np.diag([*photo.focal, 1.0]), photo=photo)
 
 
@@ -108,19 +116,19 @@ class Listed(NamedTuple):
         return self.frames
 
 
-def _at_photo(lens: Lens, photo: Path) -> tuple[Lens, bool]:
+def _fit_lens_to_photo(lens: Lens, photo: Path) -> tuple[Lens, bool]:
     """Return a lens for the size of its photo, if that has the same aspect, and whether EXIF turns the photo.
 
     A photo that cannot be read changes nothing.
     """
-    with suppress(Exception), opened_image(photo) as image:
-        size = turned(image.size) if turns(image, lens.size) else image.size
+    with suppress(Exception), open_image(photo) as image:
+        size = swap_sides(image.size) if needs_turn(image, lens.size) else image.size
         is_turned = orientation(image) != 1
-        return (lens if lens.made or not fits(size, lens.size) else lens.at(size)), is_turned
+        return (lens if lens.made or not have_same_aspect(size, lens.size) else lens.at(size)), is_turned
     return lens, False
 
 
-def rigid(matrix: Float, place: Place) -> Float:
+def make_rigid(matrix: Float, place: Place) -> Float:
     """Return the rigid transform nearest to a (4, 4) or (3, 4) pose with rounding errors or a uniform scale.
 
     Raise an `InputError` for a pose that is not finite, is mirrored, or differs from a rotation by over 1 %.
@@ -136,27 +144,27 @@ def rigid(matrix: Float, place: Place) -> Float:
     return out
 
 
-def posed(quat: ArrayLike, translation: ArrayLike) -> Float:
+def make_pose(quat: ArrayLike, translation: ArrayLike) -> Float:
     """Return the (4, 4) rigid transform of a quaternion wxyz, of any length, and a translation."""
     out = np.eye(4)
     out[:3, :3], out[:3, 3] = rotation_matrices(np.array([quat]))[0], translation
     return out
 
 
-def inverse(matrix: Float) -> Float:
+def invert_pose(matrix: Float) -> Float:
     R, t = matrix[:3, :3], matrix[:3, 3]
     out = np.eye(4)
     out[:3, :3], out[:3, 3] = R.T, -R.T @ t
     return out
 
 
-def _cameras(path: Path, frames: Sequence[Frame]) -> Cameras:
+def _stack_cameras(path: Path, frames: Sequence[Frame]) -> Cameras:
     masks = Finder()
     try:
         rows = (
             (
                 *(f.viewmat, f.lens.K, f.lens.size, f.name, f.photo),
-                *(f.lens.distortion, _mask(f, masks), f.kind, f.lens.photo),
+                *(f.lens.distortion, _find_mask(f, masks), f.kind, f.lens.photo),
             )
             for f in frames
         )
@@ -167,14 +175,14 @@ def _cameras(path: Path, frames: Sequence[Frame]) -> Cameras:
         raise InputError("the size of a view is too large", path=path) from error
 
 
-def _mask(frame: Frame, masks: Finder) -> Path | None:
+def _find_mask(frame: Frame, masks: Finder) -> Path | None:
     """Return the frame's mask, or that found for its photo."""
     if frame.mask is not None or frame.photo is None:
         return frame.mask
     return masks.mask(frame.photo, len(plain_parts(frame.listed or frame.name)))
 
 
-def view_set(listed: Listed) -> ViewSet:
+def make_view_set(listed: Listed) -> ViewSet:
     """Stack frames with unique names; frames whose photo is missing keep their pose only."""
     path, frames, left_out, further = listed
     if not frames and not listed.whole():
@@ -191,10 +199,10 @@ def view_set(listed: Listed) -> ViewSet:
             f"{plural(len(left_out), 'view')} left out, which numbers that are not finite describe: {fault}"
         )
         notes.append(Note("not_finite", len(left_out), f"{text} (view {name!r})"))
-    frames, found_notes = _checked_photos(frames)
+    frames, found_notes = _check_photos(frames)
     notes += found_notes
     if bent := [frame for frame in frames if frame.lens.photo is not None and not frame.lens.made]:
-        frames = [view for frame in frames for view in _pinholes(frame)]
+        frames = [view for frame in frames for view in _split_into_pinholes(frame)]
         models = ", ".join(sorted({frame.lens.photo.model for frame in bent if frame.lens.photo}))
         made = sum(frame.lens.photo is not None for frame in frames)
         text = f"{plural(len(bent), 'photo')} ({models}) resampled to {plural(made, 'pinhole view')}"
@@ -208,11 +216,11 @@ def view_set(listed: Listed) -> ViewSet:
         text = f"none of {plural(len(pictured), 'photo')} found; using poses only"
         notes.append(Note("no_photos", len(pictured), f"{text} (the first is {pictured[0].photo})"))
         frames = [frame._replace(photo=None) for frame in frames]
-    cameras = replace(_cameras(path, frames), source=path)
+    cameras = replace(_stack_cameras(path, frames), source=path)
     masked = sum(mask is not None for mask in cameras.mask_paths)
     if masked:
         notes.append(Note("masks", masked, f"{plural(masked, 'photo')} of {len(present)} have masks"))
-    elif present and (folders := _idle_masks(present)):
+    elif present and (folders := _find_idle_masks(present)):
         text = f"no mask in {folders[0]} is named like a photo, as {present[0].name}.png would be"
         notes.append(Note("unused_masks", 1, text))
     splits = tuple(f.split for f in frames)
@@ -225,7 +233,7 @@ def view_set(listed: Listed) -> ViewSet:
     )
 
 
-def _pinholes(frame: Frame) -> list[Frame]:
+def _split_into_pinholes(frame: Frame) -> list[Frame]:
     """Return the pinhole views of a frame, which is its only one unless its lens needs several."""
     lens = frame.lens.photo
     if lens is None or frame.lens.made:
@@ -240,7 +248,7 @@ def _pinholes(frame: Frame) -> list[Frame]:
     return views
 
 
-def _idle_masks(present: Sequence[Frame]) -> list[Path]:
+def _find_idle_masks(present: Sequence[Frame]) -> list[Path]:
     """Return folders of masks for the first photo that hold images."""
     photo, name = present[0].photo, present[0].listed or present[0].name
     folders = mask_folders(photo, len(plain_parts(name))) if photo else []
@@ -259,7 +267,7 @@ _PHOTO_NOTES = {
 """Code of a note on photos → its text after their number."""
 
 
-def _checked_photos(frames: Sequence[Frame]) -> tuple[list[Frame], list[Note]]:
+def _check_photos(frames: Sequence[Frame]) -> tuple[list[Frame], list[Note]]:
     """Drop photos that cannot be read, and photos that names of several folders were shortened to."""
     out, found = list(frames), {code: list[str]() for code in _PHOTO_NOTES}
     times = Counter(frame.photo for frame in frames)
@@ -267,7 +275,7 @@ def _checked_photos(frames: Sequence[Frame]) -> tuple[list[Frame], list[Note]]:
         photo, wanted = frame.photo, Path(frame.listed)
         if photo is None or not usable(photo):
             continue
-        if (what := unreadable(photo)) is not None:
+        if (what := describe_unreadable(photo)) is not None:
             found["unreadable_photos"].append(f"{frame.name} is {what}")
             out[i] = frame._replace(photo=None, mask=None)
         elif frame.listed and times[photo] > 1 and not is_end(frame.listed, photo):
@@ -278,7 +286,7 @@ def _checked_photos(frames: Sequence[Frame]) -> tuple[list[Frame], list[Note]]:
                 found["other_suffix"].append(f"{frame.name} is {photo.name}")
             elif is_a_photo(wanted) and plain_parts(frame.listed)[-1].lower() != photo.name.lower():
                 found["other_spelling"].append(f"{frame.name} is {photo.name}")
-            lens, is_turned = _at_photo(frame.lens, photo)
+            lens, is_turned = _fit_lens_to_photo(frame.lens, photo)
             if is_turned:
                 found["exif_orientation"].append(photo.name)
             if lens.size != frame.lens.size:
@@ -293,7 +301,7 @@ def _checked_photos(frames: Sequence[Frame]) -> tuple[list[Frame], list[Note]]:
     return out, notes
 
 
-def pictured(found: ViewSet) -> ViewSet:
+def drop_unpictured(found: ViewSet) -> ViewSet:
     """Return the views with a photo, and a note on the others; all views if none has a photo."""
     has = np.array([path is not None for path in found.cameras.image_paths], bool)
     missing = int(np.count_nonzero(~has))
@@ -304,7 +312,7 @@ def pictured(found: ViewSet) -> ViewSet:
     return found.take(has).noted("missing_photos", missing, text)
 
 
-def alpha_as_masks(found: ViewSet) -> ViewSet:
+def use_alpha_as_masks(found: ViewSet) -> ViewSet:
     """Make each photo with alpha and without a mask its own mask, and note how many."""
     cameras = found.cameras
     own = [

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from g2ard.errors import InputError
 from g2ard.io.finding import Finder
-from g2ard.io.frames import Frame, Lens, Listed, rigid
+from g2ard.io.frames import Frame, Lens, Listed, make_rigid
 from g2ard.io.jsonfile import Json, Matrix, Number, Place, Pose, Weight, Whole, checked, read_own
 from g2ard.io.paths import beside
 from g2ard.io.types import Float, Splits, ViewFiles
@@ -88,7 +88,7 @@ def _photo_lens(lens: _PhotoLens | None, place: Place) -> PhotoLens | None:
 
 def _exact(stored: Float, place: Place) -> Float:
     """Return the pose as stored if it is rigid to rounding, so that writing and reading change no bit."""
-    nearest = rigid(stored, place)
+    nearest = make_rigid(stored, place)
     return stored if len(stored) == 4 and np.allclose(nearest, stored, rtol=0, atol=1e-9) else nearest
 
 

@@ -14,15 +14,15 @@ from g2ard.io.atomic import atomic_output
 from g2ard.io.types import Bytes, Float32, Size
 
 
-def resized(image: Float32, size: Size) -> Float32:
+def resize(image: Float32, size: Size) -> Float32:
     """Resize an (H, W, C) float32 image to (width, height): by area when shrinking, bilinearly when growing.
 
-    >>> resized(np.full((4, 8, 3), 0.5, np.float32), (2, 1)).tolist()
+    >>> resize(np.full((4, 8, 3), 0.5, np.float32), (2, 1)).tolist()
     [[[0.5, 0.5, 0.5], [0.5, 0.5, 0.5]]]
     """
     for axis, length in ((0, size[1]), (1, size[0])):
         if length < image.shape[axis]:
-            image = _averaged(image, length, axis)
+            image = _average(image, length, axis)
     height, width = image.shape[:2]
     if (width, height) != size:
         planes = [Image.fromarray(np.ascontiguousarray(image[..., c])) for c in range(image.shape[2])]
@@ -31,7 +31,7 @@ def resized(image: Float32, size: Size) -> Float32:
     return np.ascontiguousarray(image)
 
 
-def _averaged(image: Float32, length: int, axis: int) -> Float32:
+def _average(image: Float32, length: int, axis: int) -> Float32:
     """Return exact means over `length` equal parts of an axis, from differences of its running sum."""
     count = image.shape[axis]
     pad = [(1, 0) if i == axis else (0, 0) for i in range(3)]

@@ -7,7 +7,7 @@ import msgspec
 import numpy as np
 
 from g2ard.io.finding import Finder
-from g2ard.io.frames import Frame, Lens, Listed, inverse, rigid
+from g2ard.io.frames import Frame, Lens, Listed, invert_pose, make_rigid
 from g2ard.io.jsonfile import Matrix, Number, Place, Vector, Whole, checked, read_any_json
 from g2ard.io.transforms import json_rows
 from g2ard.io.types import ViewFiles
@@ -55,7 +55,7 @@ def _frame(place: Place, camera: _Camera, finder: Finder | None) -> Frame:
     world_from_camera = np.column_stack([camera.rotation, camera.position])
     return Frame(
         name=camera.img_name,
-        viewmat=inverse(rigid(world_from_camera, place.to("rotation"))),
+        viewmat=invert_pose(make_rigid(world_from_camera, place.to("rotation"))),
         lens=Lens.pinhole((int(camera.width), int(camera.height)), (camera.fx, camera.fy)),
         photo=finder.photo(camera.img_name) if finder else None,
         listed=camera.img_name,

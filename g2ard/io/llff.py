@@ -7,7 +7,7 @@ import numpy as np
 
 from g2ard.errors import InputError, damaged
 from g2ard.io.finding import photos_in
-from g2ard.io.frames import Frame, Lens, Listed, inverse, rigid
+from g2ard.io.frames import Frame, Lens, Listed, invert_pose, make_rigid
 from g2ard.io.jsonfile import Place
 from g2ard.io.types import ViewFiles
 from g2ard.progress import plural
@@ -54,10 +54,10 @@ def _frame(place: Place, matrix: np.ndarray, photo: Path | None) -> Frame:
     height, width, focal = matrix[:, 4].tolist()
     if not (height >= 1 and width >= 1 and focal > 0 and np.isfinite(matrix).all()):
         raise place.error(f"has height {height}, width {width} and focal length {focal}")
-    pose = rigid(np.hstack([matrix[:, :3] @ _LLFF_AXES, matrix[:, 3:4]]), place)
+    pose = make_rigid(np.hstack([matrix[:, :3] @ _LLFF_AXES, matrix[:, 3:4]]), place)
     lens = Lens.pinhole((round(width), round(height)), (focal, focal))
     name = f"{place.index:05d}" if photo is None else photo.name
-    return Frame(name, inverse(pose), lens, photo)
+    return Frame(name, invert_pose(pose), lens, photo)
 
 
 def _photos(views: ViewFiles) -> list[Path]:

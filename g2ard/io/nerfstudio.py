@@ -11,7 +11,7 @@ import numpy as np
 import g2ard.io.colmap as colmap
 import g2ard.io.transforms as transforms
 from g2ard.errors import InputError
-from g2ard.io.frames import Frame, Listed, inverse, rigid
+from g2ard.io.frames import Frame, Listed, invert_pose, make_rigid
 from g2ard.io.jsonfile import Place, Pose, Positive, checked, read_json
 from g2ard.io.trainer_yaml import Settings, below, read_settings
 from g2ard.io.types import Float, ViewFiles
@@ -54,7 +54,7 @@ def read(views: ViewFiles) -> Listed:
     settings = read_settings(folder / CONFIG) if (folder / CONFIG).is_file() else None
     frames, A, applied_scale = _data(replace(views, path=folder), settings)
     scale = trained.scale / applied_scale
-    trained_from_saved = rigid(D @ np.linalg.inv(A), place.to("transform"))
+    trained_from_saved = make_rigid(D @ np.linalg.inv(A), place.to("transform"))
     found = Listed(file, [_moved(frame, trained_from_saved, scale) for frame in frames])
     mode = _optimized(settings)
     text = f"the run optimised its poses ({mode}); these are the poses before training"
@@ -150,9 +150,9 @@ def _optimized(settings: Settings | None) -> str | None:
 
 def _moved(frame: Frame, transform: Float, scale: float) -> Frame:
     """Move a frame by x → scale·(transform·x); the scale only applies to its centre."""
-    world_from_camera = transform @ inverse(frame.viewmat)
+    world_from_camera = transform @ invert_pose(frame.viewmat)
     world_from_camera[:3, 3] *= scale
-    return frame._replace(viewmat=inverse(world_from_camera))
+    return frame._replace(viewmat=invert_pose(world_from_camera))
 
 
 def _affine(rows: Pose, place: Place) -> Float:

@@ -9,7 +9,7 @@ import g2ard.io.colmap as colmap
 import g2ard.io.transforms as transforms
 from g2ard.errors import InputError
 from g2ard.io.finding import Finder
-from g2ard.io.frames import Frame, Lens, Listed, rigid
+from g2ard.io.frames import Frame, Lens, Listed, make_rigid
 from g2ard.io.jsonfile import Place, Pose, checked, read_any_json
 from g2ard.io.trainer_yaml import below
 from g2ard.io.types import ViewFiles
@@ -54,7 +54,7 @@ def _frame(
     place: Place, camera: _Camera, finder: Finder | None, lenses: dict[Path, dict[str, Lens]]
 ) -> Frame:
     path, file_path = place.path, Path(camera.file_path)
-    world_from_camera = rigid(np.array(camera.transform), place.to("transform"))
+    world_from_camera = make_rigid(np.array(camera.transform), place.to("transform"))
     there = below(path, file_path)
     ups = (below(path, up) for up in file_path.parents[:3] if up.parts)
     lens = _lens(place, file_path, there or next(filter(None, ups), None), lenses)

@@ -15,26 +15,26 @@ from PIL import Image, ImageCms, ImageOps
 
 from g2ard.errors import InputError
 from g2ard.io.finding import files_in
-from g2ard.io.photo_headers import opened_image, turns
+from g2ard.io.photo_headers import needs_turn, open_image
 from g2ard.io.types import Float32, Size, Values
 from g2ard.scene.samples import evenly_spaced
 
 
 def decode_photo(path: Path, like: Size | None = None) -> Float32:
-    """Decode a photo as (H, W, 3) sRGB, or as premultiplied (H, W, 4) RGBA; for `like` see `turns`."""
-    with opened_image(path) as stored:
-        wide, upright = _is_deep(stored), turns(stored, like)
+    """Decode a photo as (H, W, 3) sRGB, or as premultiplied (H, W, 4) RGBA; for `like` see `needs_turn`."""
+    with open_image(path) as stored:
+        wide, upright = _is_deep(stored), needs_turn(stored, like)
         image = ImageOps.exif_transpose(stored) if upright else stored
         if image.mode == "F":
             values = np.asarray(image)[..., None]
         elif wide:
-            words = _words(path, image, upright)
-            white = _white(path.parent, path.suffix, int(words[..., :3].max()))
+            words = _read_words(path, image, upright)
+            white = _choose_white(path.parent, path.suffix, int(words[..., :3].max()))
             values = words / white
             if words.shape[2] == 4 and words[..., 3].max() > white:  # alpha may have more bits than colours
                 values[..., 3] = words[..., 3] / 65535
         else:
-            values = np.asarray(_in_srgb(image), np.float32) / np.float32(255)
+            values = np.asarray(_convert_to_srgb(image), np.float32) / np.float32(255)
     if not (values.min() >= 0 and values.max() <= 1):  # also NaN
         text = f"expected values in [0, 1], found {values.min():g} to {values.max():g}"
         raise InputError(text, path=path, hint="convert it to 8 bits")
@@ -55,13 +55,13 @@ def _raw_mode(image: Any) -> str:
     return found[0] if found else ""
 
 
-def _words(path: Path, image: Any, upright: bool) -> Values:
+def _read_words(path: Path, image: Any, upright: bool) -> Values:
     """Return the (H, W, C) values of 16 bits. Of colours, Pillow decodes the upper bytes; told that they are
     of the other byte order, it decodes the lower ones. Grey and alpha have the size of its RGBA."""
     if image.mode.startswith("I"):
         return np.asarray(image)[..., None]
     lower: Any
-    with opened_image(path) as lower:
+    with open_image(path) as lower:
         raw = _raw_mode(lower)
         big = raw[-1] == "B" or (raw[-1] == "N" and sys.byteorder == "big")
         other = raw[:-1] + ("L" if big else "B")
@@ -83,28 +83,30 @@ _SAMPLED_PHOTOS = 5
 """Photos of a folder whose brightest value is compared."""
 
 
-def _white(folder: Path, suffix: str, brightest: int) -> float:
+def _choose_white(folder: Path, suffix: str, brightest: int) -> float:
     """Return the value of 16 bits that means white: the largest of the bits that the photos use."""
-    top = _brightest(folder, suffix)
+    top = _find_brightest(folder, suffix)
     return float(next((2**bits - 1 for bits in _BITS if 0 < top < 2**bits > brightest), 65535))
 
 
 @lru_cache(maxsize=64)
-def _brightest(folder: Path, suffix: str) -> int:
+def _find_brightest(folder: Path, suffix: str) -> int:
     """Return the brightest value of a few photos of 16 bits in a folder; 0 if each has one colour."""
     files, found = files_in(folder, suffix.lower()), 0
     for i in evenly_spaced(len(files), _SAMPLED_PHOTOS, floor=True):
-        with suppress(InputError, OSError), opened_image(files[i]) as image:
+        with suppress(InputError, OSError), open_image(files[i]) as image:
             if _is_deep(image):
-                words = _words(files[i], image, False)[..., :3]
+                words = _read_words(files[i], image, False)[..., :3]
                 found = max(found, int(words.max()) if np.ptp(words) else 0)
     return found
 
 
-def _in_srgb(image: Image.Image) -> Image.Image:
+def _convert_to_srgb(image: Image.Image) -> Image.Image:
     """Return an 8-bit image as RGB or RGBA, with its colour profile converted to sRGB."""
     mode = "RGBA" if image.has_transparency_data else "RGB"
-    change = _conversion(image.info.get("icc_profile"), image.mode if image.mode in ("L", "CMYK") else mode)
+    change = _make_conversion(
+        image.info.get("icc_profile"), image.mode if image.mode in ("L", "CMYK") else mode
+    )
     if change is None:
         return image.convert(mode)
     own = image if image.mode in ("L", "CMYK") else image.convert(mode)
@@ -113,7 +115,7 @@ def _in_srgb(image: Image.Image) -> Image.Image:
 
 
 @lru_cache(maxsize=8)
-def _conversion(profile: bytes | None, mode: str) -> ImageCms.ImageCmsTransform | None:
+def _make_conversion(profile: bytes | None, mode: str) -> ImageCms.ImageCmsTransform | None:
     """Return the conversion of a colour profile to sRGB; None if it is that, or cannot be used."""
     with suppress(ImageCms.PyCMSError, ImportError, OSError, TypeError):
         own = ImageCms.ImageCmsProfile(BytesIO(profile or b""))

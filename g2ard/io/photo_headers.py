@@ -40,7 +40,7 @@ _FILM_DIAGONAL = math.hypot(36, 24)  # diagonal of 35 mm film, mm
 
 
 @contextmanager
-def opened_image(path: Path, content: IO[bytes] | None = None) -> Iterator[Image.Image]:
+def open_image(path: Path, content: IO[bytes] | None = None) -> Iterator[Image.Image]:
     """Open `path`, or `content`, as a Pillow image after checking its size.
 
     A missing file is an `InputError`; so are exceptions in the block, about a damaged image.
@@ -61,7 +61,7 @@ def opened_image(path: Path, content: IO[bytes] | None = None) -> Iterator[Image
         except Image.DecompressionBombError as error:
             raise InputError(f"has more than {LARGEST_IMAGE:,} pixels") from error
         except UnidentifiedImageError as error:
-            if content is None and _begins(path, _TIFF):
+            if content is None and _begins_with(path, _TIFF):
                 raise InputError(_OTHER_TIFF, hint=_CONVERT_TIFF) from error
             raise InputError("is not an image") from error
         except Exception as error:  # Pillow's decoders raise any exception for damaged files
@@ -75,32 +75,36 @@ _CONVERT_TIFF = (
 )
 
 
-def _begins(path: Path, starts: tuple[bytes, ...]) -> bool:
+def _begins_with(path: Path, starts: tuple[bytes, ...]) -> bool:
     """Return whether a file begins with one of some bytes; False if it cannot be read."""
     with suppress(OSError), path.open("rb") as file:
         return file.read(8).startswith(starts)
     return False
 
 
-def photo_size(path: Path, listed_in: Path | None = None, like: tuple[float, float] | None = None) -> Size:
+def read_size(path: Path, listed_in: Path | None = None, like: tuple[float, float] | None = None) -> Size:
     """Read width and height from a photo's header, upright by EXIF if only that fits the size `like`."""
     try:
-        with opened_image(path) as image:
-            return turned(image.size) if turns(image, like) else image.size
+        with open_image(path) as image:
+            return swap_sides(image.size) if needs_turn(image, like) else image.size
     except InputError as error:
         raise error if listed_in is None else error.at(hint=f"it is listed in {listed_in}") from None
 
 
-def turned(size: Size) -> Size:
+def swap_sides(size: Size) -> Size:
     return size[1], size[0]
 
 
-def turns(image: Image.Image, like: tuple[float, float] | None) -> bool:
+def needs_turn(image: Image.Image, like: tuple[float, float] | None) -> bool:
     """Return whether EXIF turns an image by a quarter, and only then it has the aspect of `like`.
 
     Poses refer to stored pixels, unless the size of their views shows that they refer to upright photos.
     """
-    if like is None or fits(image.size, like) or not fits(turned(image.size), like):
+    if (
+        like is None
+        or have_same_aspect(image.size, like)
+        or not have_same_aspect(swap_sides(image.size), like)
+    ):
         return False
     return orientation(image) in (5, 6, 7, 8)
 
@@ -110,19 +114,19 @@ def orientation(image: Image.Image) -> int:
     return int(image.getexif().get(_ORIENTATION, 1))
 
 
-def fits(size: tuple[float, float], like: tuple[float, float]) -> bool:
+def have_same_aspect(size: tuple[float, float], like: tuple[float, float]) -> bool:
     """Return whether two sizes have the same aspect."""
     return abs(size[0] * like[1] - size[1] * like[0]) <= ASPECT_SLACK * size[1] * like[0]
 
 
-def exif_focal(path: Path) -> float | None:
+def read_focal(path: Path) -> float | None:
     """Return the focal length in pixels by a photo's EXIF, None without one or for a broken photo.
 
     It comes from the focal length for 35 mm film, whose frame has a diagonal of 43.27 mm; otherwise from that
     in millimetres and the sensor's pixels per unit.
     """
     try:
-        with opened_image(path) as image:
+        with open_image(path) as image:
             size, tags = image.size, image.getexif().get_ifd(_EXIF)
     except InputError:
         return None
@@ -138,24 +142,24 @@ def exif_focal(path: Path) -> float | None:
     return None
 
 
-def unreadable(photo: Path) -> str | None:
+def describe_unreadable(photo: Path) -> str | None:
     """Return the format of a photo that cannot be read, by its suffix and first bytes, or None."""
     if (by_suffix := other_photo(photo)) is not None:
         return by_suffix
-    if _begins(photo, _TIFF):
+    if _begins_with(photo, _TIFF):
         try:
-            with opened_image(photo):
+            with open_image(photo):
                 return None
         except InputError as error:
             return f"{error.message.removeprefix('is ')} ({error.hint})" if error.hint else None
-    sign = None if _begins(photo, PHOTOS) else foreign(photo)
+    sign = None if _begins_with(photo, PHOTOS) else foreign(photo)
     return None if sign is None else f"{sign.what} ({sign.todo})"
 
 
 def has_alpha(photo: Path) -> bool:
     """Return whether a photo's header declares transparency; False if it cannot be read."""
     try:
-        with opened_image(photo) as image:
+        with open_image(photo) as image:
             return image.has_transparency_data
     except InputError:
         return False

@@ -14,9 +14,9 @@ import numpy as np
 from g2ard.config.choices import BLACK, Colour
 from g2ard.errors import InputError
 from g2ard.io.finding import MOVING
-from g2ard.io.images import resized
+from g2ard.io.images import resize
 from g2ard.io.photo_decoding import decode_photo
-from g2ard.io.photo_headers import fits, opened_image, photo_size
+from g2ard.io.photo_headers import have_same_aspect, open_image, read_size
 from g2ard.io.types import Float, Float32, Mask, Size
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.lenses import PhotoLens
@@ -42,19 +42,19 @@ def load_photo(
     Args:
         background: None keeps alpha, as premultiplied (H, W, 4) RGBA.
     """
-    image = _image(cameras, index)
-    mask = _mask(cameras, index, image)
-    return (image if background is None else composited(image, background)), mask
+    image = _load_image(cameras, index)
+    mask = _load_mask(cameras, index, image)
+    return (image if background is None else composite(image, background)), mask
 
 
-def composited(image: Float32, background: Sequence[float]) -> Float32:
+def composite(image: Float32, background: Sequence[float]) -> Float32:
     """Composite premultiplied RGBA over a background; RGB is unchanged."""
     if image.shape[2] == 4:
         image = image[..., :3] + (1 - image[..., 3:]) * np.asarray(background, np.float32)
     return np.ascontiguousarray(image)
 
 
-def _image(cameras: Cameras, index: int) -> Float32:
+def _load_image(cameras: Cameras, index: int) -> Float32:
     path, name = cameras.image_paths[index], cameras.names[index]
     if path is None:
         raise InputError(f"({name}) has no photo", index=index, item="view", hint="pass views with photos")
@@ -64,17 +64,17 @@ def _image(cameras: Cameras, index: int) -> Float32:
     size = target if lens is None else lens.size
     try:
         several = cameras.lenses[index] is not None  # views of one photo, which follow each other
-        image = _opened(path, _modified(path), size) if several else decode_photo(path, size)
+        image = _decode_once(path, _modification_time(path), size) if several else decode_photo(path, size)
     except InputError as error:
         raise error.at(hint="; ".join(filter(None, (error.hint, named))) or None) from error
     height, width = image.shape[:2]
-    if not fits((width, height), size):
+    if not have_same_aspect((width, height), size):
         raise InputError(
             f"the photo is {width}×{height}, its view {target[0]}×{target[1]}: the aspects differ",
             path=path,
             hint="pass the uncropped photos that the poses were estimated from",
         )
-    return resized(image, target) if lens is None else _through(image, lens, cameras.Ks[index], target)
+    return resize(image, target) if lens is None else _resample(image, lens, cameras.Ks[index], target)
 
 
 def _lens_of(cameras: Cameras, index: int) -> PhotoLens | None:
@@ -102,12 +102,12 @@ class PhotoTraits:
     sizes: Mapping[Size, int]
 
 
-def photo_traits(files: Sequence[Path]) -> PhotoTraits:
+def measure_traits(files: Sequence[Path]) -> PhotoTraits:
     """Look at the headers of all photos and the borders of a few; unreadable photos are ignored."""
     sizes: Counter[Size] = Counter()
     alpha = 0
     for photo in files:
-        with suppress(InputError), opened_image(photo) as header:
+        with suppress(InputError), open_image(photo) as header:
             sizes[header.size] += 1
             alpha += header.has_transparency_data
     few = evenly_spaced(len(files), _BORDER_PHOTOS, floor=True)
@@ -134,19 +134,19 @@ def load_mask(cameras: Cameras, index: int) -> Mask | None:
     that is its own mask, and for a mask that is black all over, those whose alpha is above half. In a mask
     of labels, every label above 0 counts. instant-ngp's `dynamic_mask_*` leaves out what is white.
     """
-    return _mask(cameras, index, None)
+    return _load_mask(cameras, index, None)
 
 
-def _mask(cameras: Cameras, index: int, image: Float32 | None) -> Mask | None:
+def _load_mask(cameras: Cameras, index: int, image: Float32 | None) -> Mask | None:
     """Return the mask of a photo. A photo that is its own mask is read, unless `image` holds it."""
-    held, path = _held(cameras, index), cameras.mask_paths[index]
+    held, path = _find_held(cameras, index), cameras.mask_paths[index]
     if path is None:
         return held
     if path == cameras.image_paths[index]:
-        own = _image(cameras, index) if image is None else image
+        own = _load_image(cameras, index) if image is None else image
         mask = own[..., 3] > 0.5 if own.shape[2] == 4 else None
     else:
-        mask = _kept(_image(replace(cameras, image_paths=cameras.mask_paths), index))
+        mask = _threshold(_load_image(replace(cameras, image_paths=cameras.mask_paths), index))
         mask = ~mask if path.name.lower().startswith(MOVING) else mask
     if mask is None or held is None:
         return held if mask is None else np.ascontiguousarray(mask)
@@ -156,9 +156,9 @@ def _mask(cameras: Cameras, index: int, image: Float32 | None) -> Mask | None:
 _LABELS = 32 / 255  # brightest value below which the values of a mask are labels
 
 
-def _kept(mask: Float32) -> Mask:
+def _threshold(mask: Float32) -> Mask:
     """Return the pixels that a mask keeps."""
-    shade = composited(mask, BLACK).max(2)
+    shade = composite(mask, BLACK).max(2)
     if mask.shape[2] == 4 and not shade.any():
         return mask[..., 3] > 0.5
     top = float(shade.max())
@@ -166,20 +166,20 @@ def _kept(mask: Float32) -> Mask:
     return kept
 
 
-def _held(cameras: Cameras, index: int) -> Mask | None:
+def _find_held(cameras: Cameras, index: int) -> Mask | None:
     """Return the pixels of a view that its undistorted photo holds in full, or None if all are."""
     photo = cameras.image_paths[index]
     lens = _lens_of(cameras, index)
     if photo is None or lens is None:
         return None
     size = int(cameras.widths[index]), int(cameras.heights[index])
-    times = _samples(lens, photo_size(photo, cameras.source, lens.size)[0], cameras.Ks[index])
-    samples = _lookup(lens, cameras.Ks[index], size, times)[1]
+    times = _samples_per_side(lens, read_size(photo, cameras.source, lens.size)[0], cameras.Ks[index])
+    samples = _look_up(lens, cameras.Ks[index], size, times)[1]
     whole: Mask = np.all(samples.reshape(size[1], times, size[0], times), axis=(1, 3))
     return None if whole.all() else whole
 
 
-def _sampled(image: Float32, u: Float, v: Float, around: bool = False) -> Float32:
+def _sample(image: Float32, u: Float, v: Float, around: bool = False) -> Float32:
     """Return the (n, C) values at n places, bilinearly. Pixels have whole numbers, and edges are repeated.
 
     Args:
@@ -196,7 +196,7 @@ def _sampled(image: Float32, u: Float, v: Float, around: bool = False) -> Float3
     return np.asarray(top * (1 - down) + bottom * down)
 
 
-def _modified(path: Path) -> int | None:
+def _modification_time(path: Path) -> int | None:
     """Return a photo's time, None if it is missing, as `decode_photo` will say."""
     try:
         return path.stat().st_mtime_ns
@@ -205,31 +205,31 @@ def _modified(path: Path) -> int | None:
 
 
 @lru_cache(maxsize=1)  # several views of a photo follow each other
-def _opened(path: Path, modified: int | None, like: Size) -> Float32:
+def _decode_once(path: Path, modified: int | None, like: Size) -> Float32:
     return decode_photo(path, like)
 
 
-def _through(image: Float32, lens: PhotoLens, K: Float, size: Size) -> Float32:
+def _resample(image: Float32, lens: PhotoLens, K: Float, size: Size) -> Float32:
     """Sample a photo through its lens for each pixel of a pinhole view: bilinearly at as many points a pixel
     as the photo is finer, which are averaged."""
     height, width = image.shape[:2]
-    times = _samples(lens, width, K)
-    pixels, _ = _lookup(lens, K, size, times)
+    times = _samples_per_side(lens, width, K)
+    pixels, _ = _look_up(lens, K, size, times)
     u, v = (pixels * (np.array([width, height]) / lens.size) - 0.5).T
-    samples = _sampled(image, u, v, around=lens.model == "EQUIRECTANGULAR")
-    return resized(samples.reshape(size[1] * times, size[0] * times, -1), size)
+    samples = _sample(image, u, v, around=lens.model == "EQUIRECTANGULAR")
+    return resize(samples.reshape(size[1] * times, size[0] * times, -1), size)
 
 
 _MOST_SAMPLES = 8
 
 
-def _samples(lens: PhotoLens, width: int, K: Float) -> int:
+def _samples_per_side(lens: PhotoLens, width: int, K: Float) -> int:
     """Return the number of samples along each side of a pixel: the pixels of a photo of this width there."""
     finer = width / lens.size[0] * max(lens.focal) / min(K[0, 0], K[1, 1])
     return int(np.clip(np.ceil(finer - 0.01), 1, _MOST_SAMPLES))
 
 
-def _lookup(lens: PhotoLens, K: Float, size: Size, times: int) -> tuple[Float, Mask]:
+def _look_up(lens: PhotoLens, K: Float, size: Size, times: int) -> tuple[Float, Mask]:
     """Return the pixel of a lens for each sample of a pinhole view, and whether its photo holds it."""
     keep = _lookup_of_view if lens.model == "FULL_OPENCV" else _lookup_of_face
     return keep(lens, tuple(K.ravel()), size, times)

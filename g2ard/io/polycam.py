@@ -7,7 +7,7 @@ import numpy as np
 
 from g2ard.errors import InputError
 from g2ard.io.finding import Finder, files_in
-from g2ard.io.frames import Frame, Lens, Listed, rigid
+from g2ard.io.frames import Frame, Lens, Listed, make_rigid
 from g2ard.io.jsonfile import Number, Place, Whole, checked, read_json
 from g2ard.io.transforms import opencv_view
 from g2ard.io.types import ViewFiles
@@ -59,5 +59,5 @@ def _frame(file: Path, finder: Finder) -> Frame:
         raise place.error(f"has focal lengths {fx}, {fy} and {width}×{height} pixels")
     name = f"{file.stem}.jpg"
     lens = Lens.pinhole((width, height), (fx, fy), (cx, cy))
-    viewmat = opencv_view(rigid(np.array(pose).reshape(3, 4), place))
+    viewmat = opencv_view(make_rigid(np.array(pose).reshape(3, 4), place))
     return Frame(name, viewmat, lens, finder.photo(name), listed=name)

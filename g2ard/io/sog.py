@@ -25,7 +25,7 @@ from g2ard.errors import InputError, damaged
 from g2ard.io.jsonfile import FileName, Place, Vector, Whole, checked, parse_json, read_json
 from g2ard.io.packing import from_smallest_three
 from g2ard.io.paths import check_regular, check_unpacked, decoded, file_identity
-from g2ard.io.photo_headers import opened_image
+from g2ard.io.photo_headers import open_image
 from g2ard.io.sanitize import BLOCK, Raw, logits_of
 from g2ard.io.stream import RawStream, from_row, ranges
 from g2ard.io.types import Bytes, Float32, Note, Values
@@ -115,17 +115,17 @@ class _Chunk:
             raise InputError(f"cannot be read ({error})", path=path) from error
 
     @contextmanager
-    def opened_image(self, name: str) -> Iterator[Image]:
+    def open_image(self, name: str) -> Iterator[Image]:
         from PIL import (
             WebPImagePlugin,  # noqa: F401  (Pillow would load all its formats to find this one)
         )
 
-        with opened_image(self.place / name, io.BytesIO(self.read(name))) as image:
+        with open_image(self.place / name, io.BytesIO(self.read(name))) as image:
             yield image
 
     def image(self, name: str) -> Bytes:
         """Return (height, width, 4) bytes."""
-        with self.opened_image(name) as image:
+        with self.open_image(name) as image:
             return np.asarray(image.convert("RGBA"))
 
     def rows(self, name: str, count: int) -> Bytes:
@@ -142,7 +142,7 @@ class _Chunk:
             place = self.file.to("count") if meta.version == 2 else self.file.to("means", "shape", 0)
             raise place.error("is missing")
         first = meta.means.files[0]
-        with self.opened_image(first) as image:  # before allocating memory
+        with self.open_image(first) as image:  # before allocating memory
             pixels = image.width * image.height
         if pixels < count:
             raise InputError(f"has {pixels:,} pixels for {count:,} Gaussians", path=self.place / first)

@@ -12,10 +12,10 @@ from msgspec import UNSET, UnsetType
 
 from g2ard.errors import InputError
 from g2ard.io.finding import Finder, is_end
-from g2ard.io.frames import Frame, Lens, Listed, inverse, rigid
+from g2ard.io.frames import Frame, Lens, Listed, invert_pose, make_rigid
 from g2ard.io.jsonfile import Json, Number, Place, Pose, Vector, Whole, checked, read_json
 from g2ard.io.paths import beside
-from g2ard.io.photo_headers import fits, photo_size
+from g2ard.io.photo_headers import have_same_aspect, read_size
 from g2ard.io.types import Float, Note, Notes, Size, Splits, ViewFiles
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.lenses import PhotoLens
@@ -181,7 +181,7 @@ def _frame(place: Place, shared: Json, entry: Any, finder: Finder, masks: Finder
         content |= _from_matrix_city(folder, checked(content, _Numbered, place))
     frame = checked(content, _Frame, place)
     file_path = frame.file_path
-    world_from_camera = rigid(np.array(frame.transform_matrix), place.to("transform_matrix"))
+    world_from_camera = make_rigid(np.array(frame.transform_matrix), place.to("transform_matrix"))
     photo = finder.photo(file_path)
     mask = None
     if frame.mask_path is not None:
@@ -210,7 +210,7 @@ def _from_matrix_city(folder: Path, frame: _Numbered) -> Json:
 
 def opencv_view(world_from_camera: Float) -> Float:
     """Convert a rigid world_from_camera in OpenGL axes to a (4, 4) camera_from_world in OpenCV axes."""
-    return inverse(world_from_camera @ FLIP)
+    return invert_pose(world_from_camera @ FLIP)
 
 
 def _intrinsics(place: Place, frame: _Frame, photo: Path) -> Lens:
@@ -227,7 +227,7 @@ def _intrinsics(place: Place, frame: _Frame, photo: Path) -> Lens:
         raise error.at(hint="undistort the photos")
     width, height = _size(place, frame, photo)
     if model == "EQUIRECTANGULAR":
-        if not fits((width, height), (2, 1)):
+        if not have_same_aspect((width, height), (2, 1)):
             raise place.error(f"is a panorama of {width}×{height} pixels, expected twice as wide as high")
         return Lens.of(PhotoLens(model, (width, height), ()))
     lens = _pinhole(place, frame, (width, height))
@@ -284,7 +284,7 @@ def _size(place: Place, frame: _Frame, photo: Path) -> Size:
             return width, height
     if photo.is_file():
         stated = None if frame.cx is UNSET or frame.cy is UNSET else (2 * frame.cx, 2 * frame.cy)
-        return photo_size(photo, place.path, stated)
+        return read_size(photo, place.path, stated)
     error = place.error(f"has neither w and h nor a photo {photo}")
     raise error.at(hint="{images=DIR} names the folder of photos that are elsewhere")
 
@@ -301,7 +301,7 @@ def text_of(path: Path, cameras: Cameras, splits: Splits) -> str:
         photo, mask = (
             (cameras.image_paths[i], cameras.mask_paths[i]) if cameras.lenses[i] is None else (None, None)
         )
-        pose = np.asarray(inverse(viewmat) @ FLIP)
+        pose = np.asarray(invert_pose(viewmat) @ FLIP)
         frame = {"file_path": beside(photo, path) or f"images/{cameras.names[i]}"}
         if (covered := beside(mask, path)) is not None:
             frame["mask_path"] = covered

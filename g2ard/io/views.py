@@ -123,7 +123,7 @@ def read_view_set(
         unpictured: whether to keep views without photos among others.
         alpha: "mask" makes a photo with alpha and without a mask its own mask.
     """
-    from g2ard.io.frames import alpha_as_masks, pictured, view_set
+    from g2ard.io.frames import drop_unpictured, make_view_set, use_alpha_as_masks
     from g2ard.io.splits import split_mask
     from g2ard.io.types import ViewFiles
 
@@ -135,9 +135,9 @@ def read_view_set(
     if given.images is not None and not given.images.is_dir():
         raise InputError("no such folder of photos", path=given.images)
     with about(path):  # also for an invalid name of a photo, or a folder that cannot be read
-        views = view_set(module.read(replace(given, path=path)))
-    views = views if unpictured else pictured(views)
-    views = alpha_as_masks(views) if given.alpha == "mask" else views
+        views = make_view_set(module.read(replace(given, path=path)))
+    views = views if unpictured else drop_unpictured(views)
+    views = use_alpha_as_masks(views) if given.alpha == "mask" else views
     return views.take(split_mask(path, views.cameras.names, split, stated=views.splits))
 
 

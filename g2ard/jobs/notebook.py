@@ -16,7 +16,7 @@ from g2ard.config.checks import checks_arguments
 from g2ard.config.choices import Colour
 from g2ard.errors import InputError
 from g2ard.io import Source
-from g2ard.io.images import png_bytes, resized
+from g2ard.io.images import png_bytes, resize
 from g2ard.io.photos import load_photo
 from g2ard.io.reports import Report
 from g2ard.jobs.comparison import made_of_points
@@ -150,7 +150,7 @@ def _row(targets: Targets) -> NDArray[np.uint8]:
 def _small(image: NDArray[Any]) -> NDArray[Any]:
     height, width = image.shape[:2]
     share = min(1.0, _TARGET / max(height, width))
-    return resized(image, (max(1, round(width * share)), max(1, round(height * share))))
+    return resize(image, (max(1, round(width * share)), max(1, round(height * share))))
 
 
 def _embedded(image: NDArray[Any]) -> str:

@@ -18,7 +18,7 @@ from g2ard.errors import InputError, require
 from g2ard.io import read_view_set
 from g2ard.io.detect import file_format
 from g2ard.io.finding import photos_in
-from g2ard.io.photo_headers import exif_focal, fits, has_alpha, photo_size
+from g2ard.io.photo_headers import has_alpha, have_same_aspect, read_focal, read_size
 from g2ard.io.signs import explained
 from g2ard.jobs.inputs import load_scene
 from g2ard.jobs.trajectory import is_trajectory, read_ace, read_trajectory
@@ -210,7 +210,7 @@ def photos_of(
 
 def _exif_focals(path: Path, files: list[Path], say: Say) -> list[float]:
     """Return each photo's focal length in pixels by its EXIF; photos without one get the median."""
-    stated = [exif_focal(file) for file in files]
+    stated = [read_focal(file) for file in files]
     known = [pixels for pixels in stated if pixels is not None]
     if not known:
         raise InputError(
@@ -247,7 +247,7 @@ def _sizes(files: list[Path]) -> list[tuple[int, int]]:
     found: list[tuple[int, int] | None] = []
     for file in files:
         try:
-            found.append(photo_size(file))
+            found.append(read_size(file))
         except InputError:
             found.append(None)
     usual = next((size for size in found if size), (0, 0))
@@ -296,8 +296,8 @@ def _check_aspects(files: list[Path], sizes: list[tuple[int, int]], views: list[
 def _suits(file: Path, size: tuple[int, int], like: tuple[int, int]) -> bool:
     """Return whether a photo, upright if EXIF says so, has the aspect of its view."""
     with suppress(InputError):
-        size = photo_size(file, like=like)
-    return fits(size, like)
+        size = read_size(file, like=like)
+    return have_same_aspect(size, like)
 
 
 @explained

@@ -7,7 +7,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from g2ard.errors import InputError
-from g2ard.io.frames import inverse, posed, rigid
+from g2ard.io.frames import invert_pose, make_pose, make_rigid
 from g2ard.io.jsonfile import Place
 from g2ard.io.paths import read_text
 from g2ard.io.signs import sign_of
@@ -30,9 +30,9 @@ def read_trajectory(path: Path, names: Sequence[str]) -> dict[str, Float]:
     for place, words in _lines(path):
         values = _numbers(words)
         if len(values) == 12:
-            poses.append(inverse(rigid(values.reshape(3, 4), place)))
+            poses.append(invert_pose(make_rigid(values.reshape(3, 4), place)))
         elif len(values) == 8:
-            poses.append(inverse(_pose(values[[7, 4, 5, 6]], values[1:4], place)))
+            poses.append(invert_pose(_pose(values[[7, 4, 5, 6]], values[1:4], place)))
             times.append(float(values[0]))
         else:
             raise place.error("is not a time and a pose, nor a 3×4 matrix")
@@ -80,7 +80,7 @@ def _numbers(words: list[str]) -> Float:
 def _pose(quat: Float, translation: Float, place: Place) -> Float:
     if not quat.any():
         raise place.error("has a quaternion of length zero")
-    return posed(quat, translation)
+    return make_pose(quat, translation)
 
 
 def _numbered(name: str) -> list[str | int]:

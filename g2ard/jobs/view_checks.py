@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from g2ard.config.choices import Colour, colour_text, is_made
 from g2ard.errors import InputError
 from g2ard.io import find_views, read_view_set
-from g2ard.io.photos import photo_traits
+from g2ard.io.photos import measure_traits
 from g2ard.io.splits import split_mask
 from g2ard.jobs.inputs import GivenViews, Views
 from g2ard.progress import Say, plural, unsaid
@@ -180,7 +180,7 @@ def propose_background(cameras: Cameras, background: Colour, given: bool, say: S
     """
     pairs = zip(cameras.image_paths, cameras.mask_paths, strict=True)
     photos = [photo for photo, mask in pairs if photo is not None and mask != photo]
-    traits = photo_traits(photos)
+    traits = measure_traits(photos)
     used = colour_text(background)
     if traits.alpha and not given:
         say(

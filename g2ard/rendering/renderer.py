@@ -16,7 +16,7 @@ from g2ard.config.choices import BLACK, Convention
 from g2ard.config.schema import Settings
 from g2ard.errors import InputError, require
 from g2ard.io import read_splats
-from g2ard.io.images import png_bytes, resized, to_bytes
+from g2ard.io.images import png_bytes, resize, to_bytes
 from g2ard.scene.cameras import Camera, Cameras
 from g2ard.scene.lenses import FACES, panorama_rays, photo_of
 from g2ard.scene.prepared import DRAWN_LOG_SCALES, DRAWN_LOGITS, MAX_OPACITY
@@ -383,7 +383,7 @@ def panorama(
             x, y, z = local[number, here].T
             fine[here] = _sampled(picture, side, half * x / z + side / 2, half * y / z + side / 2)
         fine_rows = fine.reshape(rows.stop - rows.start, _FINER * width, 5)
-        out[top:bottom] = resized(fine_rows, (width, bottom - top))
+        out[top:bottom] = resize(fine_rows, (width, bottom - top))
     return np.ascontiguousarray(out[..., :3]), out[..., 3].copy(), out[..., 4].copy()
 
 

@@ -4,7 +4,7 @@ import numpy as np
 
 from benchmarks.kinds.register import displaced as off
 from benchmarks.kinds.register import result_errors
-from g2ard.io.images import resized
+from g2ard.io.images import resize
 from g2ard.scene.cameras import Camera, Cameras
 from g2ard.stages.register.align import Level, level_of
 from g2ard.stages.register.config import RegisterConfig
@@ -19,4 +19,4 @@ BALL = checkered_ball(2500)
 
 def pyramid_of(camera: Camera, image: np.ndarray, config: RegisterConfig) -> list[tuple[Camera, Level]]:
     cameras = [Cameras.of([camera]).resized(side)[0] for side in config.levels()]
-    return [(c, level_of(grey_of(resized(image, (c.width, c.height))))) for c in cameras]
+    return [(c, level_of(grey_of(resize(image, (c.width, c.height))))) for c in cameras]

@@ -13,7 +13,7 @@ from PIL import Image
 from g2ard.errors import InputError, OutputError
 from g2ard.io.finding import Finder
 from g2ard.io.images import to_bytes, write_png
-from g2ard.io.photo_headers import unreadable
+from g2ard.io.photo_headers import describe_unreadable
 from g2ard.io.photos import load_mask, load_photo
 from g2ard.scene.cameras import Cameras
 from helpers.scenes import around
@@ -293,7 +293,7 @@ def test_tiffs_that_cannot_be_read_say_so(tmp_path: Path, channels: int, kind: s
     file.write_bytes(words_tiff(np.ones((6, 8, channels), kind)))
     with pytest.raises(InputError, match=r"a\.tif: is a TIFF .*bands.*gdal_translate"):
         load_photo(camera(file, (8, 6)), 0)
-    assert "TIFF" in str(unreadable(file))
+    assert "TIFF" in str(describe_unreadable(file))
 
 
 PRIMARIES = {

@@ -13,7 +13,7 @@ import g2ard
 from g2ard.io import read_view_set, write_splats
 from g2ard.io.describe import describe
 from g2ard.io.images import write_png
-from g2ard.io.photos import photo_traits
+from g2ard.io.photos import measure_traits
 from g2ard.io.types import ViewFiles
 from g2ard.rendering.targets import Photos
 from helpers.commands import CommandLine, refused, succeeds
@@ -132,7 +132,7 @@ def test_info_describes_the_photos(rgba: Path, tmp_path: Path) -> None:
     assert "23 photos of 64×48 pixels, 1 of other sizes" in notes(tmp_path / "plain")["mixed_sizes"]
     opaque = np.concatenate([np.asarray(Image.open(second)), np.full((48, 64, 1), 255, np.uint8)], 2)
     Image.fromarray(opaque).save(second)
-    assert photo_traits([second]).alpha == 0  # an alpha channel that hides nothing
+    assert measure_traits([second]).alpha == 0  # an alpha channel that hides nothing
 
 
 def test_distill_proposes_the_border_colour(command_line: CommandLine, tmp_path: Path) -> None:

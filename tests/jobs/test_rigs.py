@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import g2ard
-from g2ard.io.images import resized, write_png
+from g2ard.io.images import resize, write_png
 from g2ard.scene.cameras import Camera, Cameras, look_at
 from g2ard.scene.lenses import FACES, PhotoLens
 from helpers.commands import CommandLine, succeeds
@@ -62,7 +62,7 @@ def fisheye(wide: np.ndarray, face: str) -> np.ndarray:
         pixels[:, 0].astype(int) % (4 * WIDTH),
     )
     shown = np.where((angle < REACH)[..., None], wide[rows, columns].reshape(3 * side, 3 * side, 3), 0)
-    return resized(shown.astype(np.float32), (side, side))
+    return resize(shown.astype(np.float32), (side, side))
 
 
 def square(side: int, focal: float) -> dict[str, float]:

@@ -157,7 +157,7 @@ def test_hidden_pixels_do_not_matter(
     masks = [load_mask(cameras, view) for view in range(len(cameras))]
     assert all(0.1 < mask.mean() < 0.9 for mask in masks[1::2] if mask is not None)
     assert len([mask for mask in masks if mask is not None]) == (5 if hidden == "every second" else 10)
-    read, found = photos._image, []
+    read, found = photos._load_image, []
     for colour in (0.2, 0.5):
 
         def spoiled(own: Cameras, view: int, colour: float = colour) -> NDArray[np.float32]:
@@ -167,7 +167,7 @@ def test_hidden_pixels_do_not_matter(
                 image[~mask, :3] = colour
             return image
 
-        monkeypatch.setattr(photos, "_image", spoiled)
+        monkeypatch.setattr(photos, "_load_image", spoiled)
         found.append(reader(cameras))
     for one, other in zip(*found, strict=True):
         np.testing.assert_array_equal(one, other)

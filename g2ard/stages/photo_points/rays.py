@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from g2ard.config.choices import BLACK, Colour
 from g2ard.errors import InputError
-from g2ard.io.photos import composited, load_photo
+from g2ard.io.photos import composite, load_photo
 from g2ard.io.types import Points
 from g2ard.progress import Progress, plural, silent
 from g2ard.scene.cameras import Cameras
@@ -94,7 +94,7 @@ def points_along_rays(
     for view in range(len(cameras)):
         image, mask = load_photo(cameras, view, None)
         outline = image[..., 3] > 0.5 if image.shape[2] == 4 else None
-        photos.append(_Photo.of(composited(image, background), mask, outline, background))
+        photos.append(_Photo.of(composite(image, background), mask, outline, background))
         outlines.append(outline if outline is None or mask is None else outline | ~mask)
         progress("photos", view + 1, len(cameras))
     rng = np.random.default_rng([seed, 11])

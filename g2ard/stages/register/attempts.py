@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from g2ard.io.images import resized
+from g2ard.io.images import resize
 from g2ard.io.photos import load_photo
 from g2ard.progress import Progress, silent
 from g2ard.rendering.renderer import Renderer
@@ -159,7 +159,7 @@ def loaded(cameras: Cameras, index: int, config: RegisterConfig, background: Seq
 def _shrunk(one: Cameras, planes: NDArray[np.float32], side: int) -> tuple[Camera, NDArray[np.float32]]:
     """Shrink (H, W, 2) planes, grey and the valid share of each pixel, to a longer side."""
     camera = one.resized(side)[0]
-    return camera, resized(planes, (camera.width, camera.height))
+    return camera, resize(planes, (camera.width, camera.height))
 
 
 def _grey(planes: NDArray[np.float32]) -> Float:
@@ -245,7 +245,7 @@ class Search:
                 aligned.append(candidate)
         if len(aligned) < 2:
             return best, [], False
-        image = softened(resized(photo.image, (camera.width, camera.height)))
+        image = softened(resize(photo.image, (camera.width, camera.height)))
         looks = [look(self.renderer, zoomed(camera, c.found.zoom, c.found.viewmat), config) for c in aligned]
         self.renders += len(looks)
 

@@ -23,7 +23,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from g2ard.io.images import resized
+from g2ard.io.images import resize
 from g2ard.rendering.renderer import Rendered, Renderer
 from g2ard.scene.cameras import Camera
 from g2ard.stages.register.config import RegisterConfig
@@ -154,7 +154,7 @@ class _Resemblance:
         share = min(1.0, _SELF_SIDE / max(camera.width, camera.height))
         self._size = width, height = round(camera.width * share), round(camera.height * share)
         planes = np.dstack([grey_of(np.clip(out.image, 0, 1)), out.alpha >= config.min_alpha])
-        small = resized(planes.astype(np.float32), (width, height)).astype(np.float64)
+        small = resize(planes.astype(np.float32), (width, height)).astype(np.float64)
         self._grey = band_passed(small[..., 0])
         self._mask = small[..., 1] > 0.999
         self._scale = np.array([width / camera.width, height / camera.height])
