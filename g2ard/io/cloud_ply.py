@@ -7,7 +7,7 @@ import numpy as np
 from numpy.lib.recfunctions import unstructured_to_structured
 
 from g2ard.errors import InputError
-from g2ard.io.judge import full_scales, unpacked
+from g2ard.io.judge import full_scales, unpack_colors
 from g2ard.io.plyfiles import (
     COLOR_NAMES,
     is_mesh,
@@ -74,7 +74,7 @@ class Stream(PointStream):
         if len(columns) == 3:
             columns = [_color(self.path, c, name) for c, name in zip(columns, self._names, strict=True)]
         elif columns and self._names[0] in _PACKED:
-            columns = unpacked(columns[0])
+            columns = unpack_colors(columns[0])
         columns += [rows[self._named[name]] for name in self.also]
         noise = np.zeros(len(rows), bool)
         with np.errstate(invalid="ignore", over="ignore"):  # a signalling NaN

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from g2ard.errors import InputError, damaged
-from g2ard.io.judge import full_scales, unpacked
+from g2ard.io.judge import full_scales, unpack_colors
 from g2ard.io.paths import decoded, plain_numbers, read_text
 from g2ard.io.signs import is_table
 from g2ard.io.stream import HeldPoints
@@ -50,7 +50,7 @@ class Stream(HeldPoints):
         if "rgb" in names and "red" not in names:
             packed = table[:, names.index("rgb")]
             whole = (packed == np.rint(packed)).all()
-            table = np.column_stack([table, *unpacked(packed.astype("<u4" if whole else "<f4"))])
+            table = np.column_stack([table, *unpack_colors(packed.astype("<u4" if whole else "<f4"))])
             names = [*names[: table.shape[1] - 3], "red", "green", "blue", *names[table.shape[1] - 3 :]]
         column = {name: names.index(name) for name in _COLUMNS if name in names}
         if missing := [name for name in "xyz" if name not in column]:
@@ -179,7 +179,7 @@ def _pcd(path: Path) -> tuple[list[str], Float]:
         own = table[name].reshape(len(table), -1)
         if field.lower() in ("rgb", "rgba") and own.dtype.itemsize == 4:
             names += ["red", "green", "blue"]
-            columns += unpacked(own[:, 0])
+            columns += unpack_colors(own[:, 0])
         else:
             names += [*_names(field), *(f"{field}_{k}" for k in range(1, own.shape[1]))]
             columns += list(own.T.astype(float))

@@ -25,7 +25,7 @@ from g2ard.config.choices import AXES, Axes
 from g2ard.errors import InputError, damaged, require
 from g2ard.io.atomic import atomic_output
 from g2ard.io.jsonfile import Json, Number, Place, Row, Vector, Whole, checked, parse_json
-from g2ard.io.judge import fill
+from g2ard.io.judge import fill_linear
 from g2ard.io.packing import packing_order, rounding, unit_quats, writable
 from g2ard.io.paths import check_regular, decoded
 from g2ard.io.sanitize import Raw, cleaned
@@ -444,7 +444,7 @@ def _attributes_of(place: Place, document: _Document, binary: bytes, names: Json
     color = values("COLOR_0", 4) if draft else np.zeros((0, 4), np.float32)
     opacities = color[:, 3] if draft and opacity not in names else values(opacity, 1)[:, 0]
     sh0 = (color[:, :3] - 0.5) / SH_C0 if draft else values(base, 3)
-    notes = fill(raw, values(f"{EXTENSION}:SCALE", 3), opacities, sh0)
+    notes = fill_linear(raw, values(f"{EXTENSION}:SCALE", 3), opacities, sh0)
     if draft:
         text = f"written by a draft of {EXTENSION} ({', '.join(own)})"
         notes.append(Note("first_draft", len(means), text))

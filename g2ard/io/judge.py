@@ -41,7 +41,7 @@ def full_scales(kind: np.dtype[Any]) -> tuple[float, ...]:
     return (*(full for full in _FULL if full < most), most)
 
 
-def bulk(values: Values) -> tuple[float, float]:
+def bulk_range(values: Values) -> tuple[float, float]:
     """Return the range of most of the finite values; (0, 0) without any."""
     finite = values[np.isfinite(values)]
     if not finite.size:
@@ -50,15 +50,15 @@ def bulk(values: Values) -> tuple[float, float]:
     return float(low), float(high)
 
 
-def white(colors: Values, scales: Sequence[float]) -> float:
+def choose_white(colors: Values, scales: Sequence[float]) -> float:
     """Return the smallest of the scales that holds most of the (n, 3) colours that are not black.
 
     >>> stray = np.array([[200.0, 9, 0]] * 500 + [[65535.0, 65535, 65535]])
-    >>> white(stray, full_scales(np.dtype("u2")))
+    >>> choose_white(stray, full_scales(np.dtype("u2")))
     255.0
     """
     brightest = colors.max(axis=1, initial=0)
-    top = bulk(brightest[brightest > 0])[1]
+    top = bulk_range(brightest[brightest > 0])[1]
     fits = (full for full in scales if 0 < top <= full * (HDR if full == 1 else 1.001))
     return next(fits, scales[-1])
 
@@ -67,7 +67,7 @@ _FINE = 0.25  # part of the distance of points by which float32 may round them
 
 
 @np.errstate(over="ignore", invalid="ignore")
-def coarse(positions: Values, apart: float) -> Notes:
+def note_coarse(positions: Values, apart: float) -> Notes:
     """Return a note if float32 rounded (n, 3) positions by much of the distance `apart` between them."""
     if not len(positions) or not np.array_equal(positions, positions.astype(np.float32)):
         return ()
@@ -81,25 +81,25 @@ def coarse(positions: Values, apart: float) -> Notes:
 
 def spacing(positions: Values, count: int) -> float:
     """Return the usual distance of `count` neighbours along the two longer sides of most (n, 3) positions."""
-    sides = [high - low for low, high in map(bulk, positions.T)]
+    sides = [high - low for low, high in map(bulk_range, positions.T)]
     return math.sqrt(math.prod(sorted(sides)[1:]) / max(1, count))
 
 
-def unpacked(packed: Values) -> list[Float]:
+def unpack_colors(packed: Values) -> list[Float]:
     """Return red, green and blue of PCL's colours, 0xRRGGBB in 32-bit integers or in floats of these bits."""
     bits = np.ascontiguousarray(packed).view("<u4")
     return [(bits >> shift & 255).astype(float) for shift in (16, 8, 0)]
 
 
-def shades(values: Values, limits: tuple[float, float] | None = None) -> tuple[float, float]:
+def choose_shades(values: Values, limits: tuple[float, float] | None = None) -> tuple[float, float]:
     """Return the intensities that mean black and white: stated limits, if most values fill a part of them."""
-    low, high = bulk(values)
+    low, high = bulk_range(values)
     if limits and low >= limits[0] and high <= limits[1] and high - low >= _FILLED * (limits[1] - limits[0]):
         return limits
     return low, high
 
 
-def tells(values: Values) -> bool:
+def has_contrast(values: Values) -> bool:
     """Return whether colours (n, 3) are not all black, or intensities (n, 1) vary."""
     finite = values[np.isfinite(values).all(axis=1)]
     return bool(finite.any() if values.shape[1] == 3 else np.ptp(finite) > 0) if finite.size else False
@@ -132,7 +132,7 @@ class Reading:
 
 
 @np.errstate(invalid="ignore")  # signalling NaNs
-def judged(
+def judge_storage(
     scales: Values, opacities: Values, base: Values, *, logs: bool, apart: float = math.inf
 ) -> Reading:
     """Judge how a scene's scales (n, k), opacities (n,) and base colours (n, 3) are stored.
@@ -142,12 +142,12 @@ def judged(
             The definition holds, and doubts are noted, unless the numbers make no sense in it.
         apart: usual distance of neighbours, which equal scales do not exceed by much.
     """
-    count, (small, large), (faint, solid) = len(opacities), bulk(scales), bulk(opacities)
+    count, (small, large), (faint, solid) = len(opacities), bulk_range(scales), bulk_range(opacities)
     enough = count >= _FEWEST
     told: list[str] = []
     opaque, notes = None if logs else 1.0, list[Note]()
     if faint >= 0 and solid > 0 and _are_whole(opacities):
-        opaque = white(opacities[:, None], full_scales(opacities.dtype)) if solid > 1 else 1.0
+        opaque = choose_white(opacities[:, None], full_scales(opacities.dtype)) if solid > 1 else 1.0
         if opaque > 1:
             notes.append(Note("opacities", count, f"opacities are whole numbers, taken as 0 to {opaque:g}"))
     elif not logs and (faint < -_OUTSIDE or solid > 1 + _OUTSIDE):
@@ -164,10 +164,10 @@ def judged(
         notes.append(Note("log_scales", count, "scales are below 0, so all are taken as logarithms"))
     elif logs and enough and small > 0 and np.mean(scales, where=np.isfinite(scales)) < 1 and unequal:
         told.insert(0, f"scales ({small:.3g} to {large:.3g}) look linear, not logarithms")
-    dark, bright = bulk(base)
+    dark, bright = bulk_range(base)
     full = None
     if dark >= 0 and bright > 1 and _are_whole(base):
-        full = white(base, full_scales(base.dtype))
+        full = choose_white(base, full_scales(base.dtype))
         notes.append(Note("base_colors", count, f"base colours are whole numbers, taken as 0 to {full:g}"))
     elif enough and 0 <= dark < bright - 0.5 and bright <= 1:
         told.append(f"base colours ({dark:.3g} to {bright:.3g}) look like RGB, not coefficients")
@@ -176,9 +176,9 @@ def judged(
     return Reading(log_scales, opaque, full, tuple(notes))
 
 
-def fill(raw: Raw, scales: Values, opacities: Values, base: Values) -> list[Note]:
+def fill_linear(raw: Raw, scales: Values, opacities: Values, base: Values) -> list[Note]:
     """Fill in a scene of a format of linear scales and opacities, as they are judged; return notes."""
-    read = judged(scales, opacities, base, logs=False)
+    read = judge_storage(scales, opacities, base, logs=False)
     with np.errstate(divide="ignore", invalid="ignore"):
         raw.log_scales[:] = scales if read.log_scales else np.log(scales.astype(float))
         raw.logit_opacities[:], raw.sh0[:, 0] = read.opacity_logits(opacities), read.sh0(base)
@@ -189,4 +189,6 @@ def _are_whole(values: Values) -> bool:
     """Return whether values are whole numbers of a larger range than coefficients and logits have."""
     if values.dtype.kind in "iu":
         return True
-    return bulk(values)[1] > _LARGEST_LOGIT and bool((values == np.rint(values))[np.isfinite(values)].all())
+    return bulk_range(values)[1] > _LARGEST_LOGIT and bool(
+        (values == np.rint(values))[np.isfinite(values)].all()
+    )

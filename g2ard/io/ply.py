@@ -10,7 +10,7 @@ from numpy.lib.recfunctions import structured_to_unstructured
 import g2ard.io.plyfiles as plyfiles
 from g2ard.config.choices import PlyLayout, RenderModel
 from g2ard.errors import InputError, require
-from g2ard.io.judge import Reading, coarse, full_scales, judged, spacing, white
+from g2ard.io.judge import Reading, choose_white, full_scales, judge_storage, note_coarse, spacing
 from g2ard.io.packing import rounding
 from g2ard.io.sanitize import BLOCK, LOG_SCALE_LIMIT, Raw
 from g2ard.io.stream import RawStream, SceneStream
@@ -120,12 +120,12 @@ class Stream(RawStream):
         with np.errstate(over="ignore", invalid="ignore"):
             wide = 2 * np.exp(np.median(scales)) if len(rows) else 0.0
         means = self._columns(rows, _MEANS)
-        self.notes += coarse(means, float(wide))
+        self.notes += note_coarse(means, float(wide))
         apart = spacing(means, self.count)
         if self._rgb is None:
-            return judged(scales, opacities, base, logs=True, apart=apart), 1.0
-        full = white(base, full_scales(base.dtype))
-        return judged(scales, opacities, np.zeros((0, 3)), logs=True, apart=apart), full
+            return judge_storage(scales, opacities, base, logs=True, apart=apart), 1.0
+        full = choose_white(base, full_scales(base.dtype))
+        return judge_storage(scales, opacities, np.zeros((0, 3)), logs=True, apart=apart), full
 
     def _decode(self, block: Values, raw: Raw) -> None:
         raw.means[:] = self._means(block)

@@ -13,9 +13,9 @@ from typing import Any, Generic, Literal, NamedTuple, Self, TypeVar
 
 import numpy as np
 
-import g2ard.io.judge as judge
 from g2ard.config.choices import Axes, RenderModel
 from g2ard.errors import InputError
+from g2ard.io.judge import HDR, choose_shades, choose_white, has_contrast, note_coarse, spacing
 from g2ard.io.paths import file_identity
 from g2ard.io.sanitize import BLOCK, Raw, Tally
 from g2ard.io.types import Cloud, Float, Float32, Mask, Note, Notes, Points, Values
@@ -313,7 +313,7 @@ class PointStream(Stream[RawPoints]):
         self._zeros_are_lost = away or zeros > max(_FEW_BLACK, _BLACK_SHARE * len(good))
         good = placed if self._zeros_are_lost and placed.any() else good
         self.sample = positions[good]
-        notes = (*notes, *judge.coarse(self.sample, judge.spacing(self.sample, count)))
+        notes = (*notes, *note_coarse(self.sample, spacing(self.sample, count)))
         notes = (*notes, _DEGREES) if _in_degrees(middle, extent) else notes
         super().__init__(path, count, np.rint(middle) if far else None, notes, "point")
         self.channels, self.scales = values.shape[1], scales
@@ -323,9 +323,9 @@ class PointStream(Stream[RawPoints]):
         self.axes: Axes | None = "RFU" if far else None
         self._range = 0.0, 1.0
         if self.channels == 3:
-            self._range = 0.0, judge.white(values[good], scales)
+            self._range = 0.0, choose_white(values[good], scales)
         elif self.channels == 1:
-            self._range = judge.shades(values[good], limits)
+            self._range = choose_shades(values[good], limits)
             self.channels = int(self._range[0] < self._range[1])
 
     def shown(self, values: Float32) -> Float32:
@@ -335,7 +335,7 @@ class PointStream(Stream[RawPoints]):
         dark, full = self._range
         with np.errstate(invalid="ignore"):
             shades = (values - np.float32(dark)) / np.float32(full - dark)
-        self.tally.bright += int(np.count_nonzero((shades > judge.HDR).any(axis=1)))
+        self.tally.bright += int(np.count_nonzero((shades > HDR).any(axis=1)))
         return np.broadcast_to(np.clip(shades, 0, 1), (len(values), 3))
 
     @abstractmethod
@@ -574,7 +574,7 @@ def telling(
     for names in choices or [()]:
         positions, values, noise = (np.concatenate(column) for column in zip(*read(names), strict=True))
         found.append((names, (positions, values, noise)))
-    return next((each for each in found if judge.tells(each[1][1][~each[1][2]])), found[0])
+    return next((each for each in found if has_contrast(each[1][1][~each[1][2]])), found[0])
 
 
 def ranges(counts: Sequence[int], rows: int) -> list[tuple[int, int]]:

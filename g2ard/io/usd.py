@@ -16,7 +16,7 @@ from g2ard.config.choices import AXES
 from g2ard.errors import InputError, OutputError, missing
 from g2ard.io.atomic import atomic_output
 from g2ard.io.glb import LINEAR_NOTE, placed
-from g2ard.io.judge import fill, white
+from g2ard.io.judge import choose_white, fill_linear
 from g2ard.io.packing import rounding, unit_quats, writable
 from g2ard.io.sanitize import Raw, cleaned
 from g2ard.io.signs import MESH, SCAN
@@ -223,9 +223,9 @@ def _read_prim(pxr: Any, prim: Any) -> Noted:
         rgb = _values(pxr, prim, _COLOR, 3, None)
         if len(rgb) not in (1, count):
             raise InputError(f"has {len(rgb):,} values, expected {count:,}", property=_COLOR)
-        base = np.broadcast_to((rgb / white(rgb, (1.0, 255.0)) - 0.5) / SH_C0, (count, 3))
+        base = np.broadcast_to((rgb / choose_white(rgb, (1.0, 255.0)) - 0.5) / SH_C0, (count, 3))
         notes.append(Note("display_color", count, "colours are those of displayColor, taken as sRGB"))
-    notes += fill(raw, _values(pxr, prim, "scales", 3, count), alphas, base)
+    notes += fill_linear(raw, _values(pxr, prim, "scales", 3, count), alphas, base)
     if _color_space(pxr, prim).lower().startswith("lin"):
         notes.append(LINEAR_NOTE)
     return cleaned(raw, notes)

@@ -11,11 +11,11 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-import g2ard.io.judge as judge
 from g2ard.config.choices import PointColor
 from g2ard.config.schema import Settings
 from g2ard.errors import InputError, require
 from g2ard.io import Source
+from g2ard.io.judge import choose_shades
 from g2ard.io.sanitize import Tally
 from g2ard.io.stream import JoinedClouds, MarkedPoints, PointStream, from_row, ranges
 from g2ard.io.types import Float32, Note, Notes, Points
@@ -160,7 +160,7 @@ class ChosenPoints(PointStream):
             if len(found) and not np.ptp(found):
                 text = f"colours nothing: it is {found[0, 0]:g} at all points"
                 raise InputError(text, path=stream.path, property=self._shade)
-            self.channels, self._range = 1, judge.shades(found)
+            self.channels, self._range = 1, choose_shades(found)
 
     def identity(self) -> list[Any]:
         return [*self._whole.identity(), list(astuple(self._choice))]

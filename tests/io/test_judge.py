@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from plyfile import PlyData, PlyElement
 
-from g2ard.io.judge import full_scales, judged, white
+from g2ard.io.judge import choose_white, full_scales, judge_storage
 from g2ard.scene.splats import SH_C0
 from helpers.opened import read_scene
 
@@ -30,7 +30,7 @@ def sigmoid(logits):
 )
 def test_whole_numbers_are_parts_of_their_range(kind: str, top: int, logs: bool) -> None:
     stored, colors = np.rint(ALPHAS * top).astype(kind), np.rint(RGB * top).astype(kind)
-    read = judged(np.log(SCALES) if logs else SCALES, stored, colors, logs=logs)
+    read = judge_storage(np.log(SCALES) if logs else SCALES, stored, colors, logs=logs)
     np.testing.assert_allclose(sigmoid(read.opacity_logits(stored)), ALPHAS, atol=0.5 / 255)
     np.testing.assert_allclose(read.sh0(colors), BASE, atol=0.01)
     assert [note.code for note in read.notes] == ["opacities", "base_colors"]
@@ -39,11 +39,11 @@ def test_whole_numbers_are_parts_of_their_range(kind: str, top: int, logs: bool)
 def test_linear_opacities_a_little_past_1_stay_opaque() -> None:
     stored = np.minimum(ALPHAS * 1.0001 + 1e-7, 1.0000001)
     stored[3] = -1e-4
-    read = judged(SCALES, stored, BASE, logs=False)
+    read = judge_storage(SCALES, stored, BASE, logs=False)
     np.testing.assert_allclose(sigmoid(read.opacity_logits(stored)), np.clip(stored, 0, 1))
     assert read.notes == ()
     stored[7] = 3
-    read = judged(SCALES, stored, BASE, logs=False)
+    read = judge_storage(SCALES, stored, BASE, logs=False)
     assert sigmoid(read.opacity_logits(stored))[7] == 1
     assert [(note.code, note.count) for note in read.notes] == [("opacities", 1)]
 
@@ -51,7 +51,7 @@ def test_linear_opacities_a_little_past_1_stay_opaque() -> None:
 @pytest.mark.parametrize("shift", [0.0, 8.0])  # also if all are positive
 def test_logits_and_logarithms_where_linear_ones_are_defined(shift: float) -> None:
     logs = np.log(SCALES[1:])
-    read = judged(logs, LOGITS + shift, BASE[1:], logs=False)
+    read = judge_storage(logs, LOGITS + shift, BASE[1:], logs=False)
     assert (read.log_scales, read.opaque) == (True, None)
     np.testing.assert_array_equal(read.opacity_logits(LOGITS), LOGITS)
     assert {note.code for note in read.notes} == {"log_scales", "opacities"}
@@ -73,7 +73,7 @@ def test_logits_and_logarithms_where_linear_ones_are_defined(shift: float) -> No
 def test_activated_values_in_a_ply_are_noted(
     scales: np.ndarray, opacities: np.ndarray, base: np.ndarray, words: list[str]
 ) -> None:
-    read = judged(scales, opacities, base, logs=True)
+    read = judge_storage(scales, opacities, base, logs=True)
     text = " ".join(note.text for note in read.notes)
     assert [word for word in ("scales", "opacities", "base colours") if f"{word} (" in text] == words
     assert (read.log_scales, read.opaque, read.white) == (True, None, None)
@@ -102,10 +102,10 @@ def test_a_ply_of_bytes(tmp_path: Path) -> None:
 def test_black_tells_nothing_of_white() -> None:
     """A cloud without colours has the full range of its type; one that is mostly black that of the rest."""
     sixteen = full_scales(np.dtype("u2"))
-    assert white(np.zeros((99, 3)), sixteen) == 65535
+    assert choose_white(np.zeros((99, 3)), sixteen) == 65535
     mostly = np.zeros((9000, 3))
     mostly[:60] = 200
-    assert white(mostly, sixteen) == 255
+    assert choose_white(mostly, sixteen) == 255
 
 
 @pytest.mark.parametrize(
@@ -114,18 +114,18 @@ def test_black_tells_nothing_of_white() -> None:
 )
 def test_linear_opacities_are_logits_if_they_leave_their_range(low: float, high: float, logits: bool) -> None:
     """A tenth beyond 0 or 1 is noise."""
-    read = judged(SCALES, np.linspace(low, high, COUNT), BASE, logs=False)
+    read = judge_storage(SCALES, np.linspace(low, high, COUNT), BASE, logs=False)
     assert (read.opaque is None) == logits
 
 
 @pytest.mark.parametrize(("least", "logs"), [(-0.5, True), (0.0, False)])
 def test_linear_scales_are_logarithms_if_they_are_below_0(least: float, logs: bool) -> None:
     scales = np.linspace(least, 2, 3 * COUNT).reshape(COUNT, 3)
-    assert judged(scales, ALPHAS, BASE, logs=False).log_scales == logs
+    assert judge_storage(scales, ALPHAS, BASE, logs=False).log_scales == logs
 
 
 @pytest.mark.parametrize(("low", "white_at"), [(0, 255), (-40, None)])
 def test_whole_numbers_below_0_are_no_colours(low: int, white_at: float | None) -> None:
     colors = np.tile(np.arange(low, 256.0), (3, 1)).T
     count = len(colors)
-    assert judged(SCALES[:count], ALPHAS[:count], colors, logs=False).white == white_at
+    assert judge_storage(SCALES[:count], ALPHAS[:count], colors, logs=False).white == white_at
