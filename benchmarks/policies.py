@@ -1,8 +1,8 @@
 """Policies of view selection for studies: those of g2ard, and others that do not pay (decision 0014)."""
 
 import numpy as np
+from numpy.typing import NDArray
 
-import g2ard._core as _core
 from g2ard.config import choices
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats
@@ -53,12 +53,23 @@ def _farthest(candidates: Candidates) -> Order:
 
 
 def _covering(splats: Splats, cameras: Cameras, options: CoverageOptions) -> Order:
-    """Return the views that see a cell, in greedy order of the cells that they see."""
+    """Return the views that see a cell, in greedy order of the fair utilities of the cells that they see."""
     cells = surface(splats, options.cells)
     starts, seen = visible_cells(splats, cells, cameras, depth_tolerance=options.depth_tolerance)
-    positions = np.ascontiguousarray(cameras.recentred(cells.origin).positions)
-    order, *_ = _core.select_greedy(
-        cells.parts, (starts, seen, positions), len(cameras), directional=False, config=options
-    )
-    sees = np.diff(starts.astype(np.int64)) > 0
-    return order[sees[order]].astype(np.int64)
+    views = np.split(seen, starts[1:-1].astype(np.int64))
+    left = [view for view, own in enumerate(views) if len(own)]
+    times_seen = np.zeros(len(cells.centers))
+    order = []
+    while left:
+        gains = cells.weights * (_utility(times_seen + 1, options) - _utility(times_seen, options))
+        best = max(left, key=lambda view: gains[views[view]].sum())
+        left.remove(best)
+        order.append(best)
+        times_seen[views[best]] += 1
+    return np.array(order, np.int64)
+
+
+def _utility(times: NDArray[np.float64], options: CoverageOptions) -> NDArray[np.float64]:
+    """Return u(offset + times), see `CoverageOptions`."""
+    x = options.offset + times / (1 + options.epsilon)
+    return np.log(x) if options.alpha == 1 else x ** (1 - options.alpha) / (1 - options.alpha)

@@ -115,7 +115,6 @@ class VisibilityAccumulator:
     def add(
         self, views: list[_View], options: RasterSettings, progress: Callable[[int, int], None] | None = None
     ) -> int: ...
-    def add_box(self, view: _View, options: RasterSettings, corners: _Corners, light: _F32) -> None: ...
     def by_row(self) -> tuple[_F32, _F32]: ...
 
 _F32 = NDArray[np.float32]
@@ -153,13 +152,12 @@ class Rasterizer:
         view: _View,
         options: RasterSettings,
         corners: _Corners,
-        planes: tuple[_F32, _F32, _F32 | None, _F32 | None],
+        planes: tuple[_F32, _F32],
         bounds: RowBounds | None = None,
     ) -> None: ...
     def backward(
         self, arrays: _Arrays, image: _F32, alpha: _F32 | None = None, depth: _F32 | None = None
     ) -> list[_F32]: ...
-    def pose_gradient(self, arrays: _Arrays, image: _F32) -> list[float]: ...
 
 def adam_rows(
     attributes: list[tuple[Any, ...]],
@@ -235,7 +233,6 @@ def select_greedy(
     surface: _Surface,
     views: tuple[NDArray[np.uint64], NDArray[np.uint32], _F64],
     k: int,
-    directional: bool,
     config: CoverageOptions,
     progress: Callable[[int, int], None] | None = None,
 ) -> tuple[NDArray[np.uint32], _F64, int]: ...

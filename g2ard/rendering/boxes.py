@@ -1,4 +1,4 @@
-"""Images and visibility of a scene that is drawn box by box, front to back.
+"""Images of a scene that is drawn box by box, front to back.
 
 A pair of a Gaussian and a pixel belongs to the box that holds the point of the pixel's ray at the
 Gaussian's depth. Along each ray this point passes through the boxes of a kd tree in the order in which the
@@ -18,10 +18,9 @@ from numpy.typing import NDArray
 import g2ard._core as _core
 from g2ard.config.choices import BLACK
 from g2ard.errors import require
-from g2ard.rendering.renderer import RasterSettings, Rendered, Renderer, corners_of, view_of
+from g2ard.rendering.renderer import RasterSettings, Renderer, corners_of, view_of
 from g2ard.scene.cameras import Camera, Cameras
 from g2ard.scene.kdtree import KdTree
-from g2ard.scene.prepared import as_prepared
 from g2ard.scene.splats import Splats
 
 _Floats = NDArray[np.float32]
@@ -42,23 +41,17 @@ class Canvas:
         camera: the view, world coordinates.
         color: (H, W, 3) float32, Σ αT·c.
         light: (H, W) float32, the light that is left, negative where the pixel has stopped.
-        depth: (H, W) float32, Σ αT·z, scene units; None unless requested.
-        median: (H, W) float32, depth of the splat at which the light falls below one half, scene units, 0 as
-            long as it does not; None unless requested.
     """
 
     camera: Camera
     color: _Floats
     light: _Floats
-    depth: _Floats | None = None
-    median: _Floats | None = None
 
     @classmethod
-    def blank(cls, camera: Camera, *, depths: bool = False) -> Canvas:
-        """Return a canvas of a view on which nothing is drawn; `depths` adds depth and median depth."""
+    def blank(cls, camera: Camera) -> Canvas:
+        """Return a canvas of a view on which nothing is drawn."""
         size = camera.height, camera.width
-        planes = [np.zeros(size, np.float32) for _ in range(2 * depths)]
-        return cls(camera, np.zeros((*size, 3), np.float32), np.ones(size, np.float32), *planes)
+        return cls(camera, np.zeros((*size, 3), np.float32), np.ones(size, np.float32))
 
     def draw(self, renderer: Renderer, box: NDArray[np.float64]) -> None:
         """Draw a box of a scene behind what is drawn.
@@ -68,7 +61,7 @@ class Canvas:
                 one offset and the settings, with a near plane.
             box: (2, 3) low and high corners, world coordinates, infinite where it is open.
         """
-        renderer.draw(self.camera, box, self.color, self.light, self.depth, self.median)
+        renderer.draw(self.camera, box, self.color, self.light)
 
     def light_on(self, box: NDArray[np.float64]) -> float:
         """Return the most light left in pixels whose rays meet a box, without those that have stopped.
@@ -78,38 +71,10 @@ class Canvas:
         view = view_of(Cameras.of([self.camera]), 0, _ANY_DEPTH)
         return _core.light_on(self.light, view, _ANY_DEPTH, corners_of(box))
 
-    def finished(self, background: Sequence[float] = BLACK) -> Rendered:
-        """Return the image in front of a background, RGB in [0, 1], like `Renderer.render`."""
-        left = np.abs(self.light)
-        image = self.color + left[..., None] * np.asarray(background, np.float32)
-        depth = np.zeros_like(left) if self.depth is None else self.depth
-        return Rendered(image, 1 - left, depth, self.median)
-
-
-class BoxVisibility:
-    """Contribution of a box's Gaussians to views, Σ αT²; add up those of a Gaussian that reaches several."""
-
-    def __init__(self, splats: Splats) -> None:
-        scene = as_prepared(splats)
-        self._offset = scene.offset
-        self._sums = _core.VisibilityAccumulator(scene.core)
-
-    def add(self, camera: Camera, light: _Floats, box: NDArray[np.float64], settings: RasterSettings) -> None:
-        """Add a view whose boxes in front were added.
-
-        Args:
-            camera: the view, world coordinates.
-            light: (H, W) float32, the light in front of the box; becomes that behind it. A pixel with at most
-                1e-4 has stopped.
-            box: (2, 3) low and high corners, world coordinates.
-            settings: conventions with a near plane and `antialiased`, the same for all boxes.
-        """
-        view = view_of(Cameras.of([camera]).recentred(self._offset), 0, settings)
-        self._sums.add_box(view, settings, corners_of(box - self._offset), light)
-
-    def by_row(self) -> tuple[_Floats, _Floats]:
-        """Return (N,) Σ αT², and the (N,) smallest size of a pixel, which does not depend on boxes."""
-        return self._sums.by_row()
+    def finished(self, background: Sequence[float] = BLACK) -> _Floats:
+        """Return the (H, W, 4) image in front of a background, RGB in [0, 1], and its alpha."""
+        left = np.abs(self.light)[..., None]
+        return np.dstack([self.color + left * np.asarray(background, np.float32), 1 - left])
 
 
 def front_to_back(tree: KdTree, position: NDArray[np.float64]) -> list[int]:

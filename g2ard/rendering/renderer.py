@@ -232,14 +232,11 @@ class Renderer:
         box: NDArray[np.float64],
         color: _Floats,
         light: _Floats,
-        depth: _Floats | None = None,
-        median: _Floats | None = None,
     ) -> None:
         """Draw a box of the scene on the planes of a `rendering.boxes.Canvas`, in place."""
-        planes = color, light, depth, median
         corners = corners_of(box - self._offset)
         view = self._view(camera)
-        self._rasterizer.draw(self._arrays, view, self._settings, corners, planes, self._bounds)
+        self._rasterizer.draw(self._arrays, view, self._settings, corners, (color, light), self._bounds)
 
     @checks_arguments
     def panorama(self, camera: Camera, *, width: Annotated[int, Within("[4, inf)")] = 2048) -> Rendered:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from g2ard.io.tile_store import TileStore
 from g2ard.rendering.boxes import FAINT, Canvas, front_to_back, reaching
-from g2ard.rendering.renderer import RasterSettings, Rendered, Renderer
+from g2ard.rendering.renderer import RasterSettings, Renderer
 from g2ard.rendering.targets import rounded
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats
@@ -86,10 +86,8 @@ def draw(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
     return {str(n): _stored(image, arguments["opacity"]) for n, image in zip(numbers, finished, strict=True)}
 
 
-def _stored(drawn: Rendered, opacity: bool) -> NDArray[Any]:
-    if opacity:
-        return np.dstack([drawn.image, drawn.alpha])
-    return rounded(np.clip(drawn.image, 0, 1))
+def _stored(drawn: NDArray[np.float32], opacity: bool) -> NDArray[Any]:
+    return drawn if opacity else rounded(np.clip(drawn[..., :3], 0, 1))
 
 
 def reaching_into(store: TileStore, tile: int, cameras: Cameras, wide_files: Sequence[Path]) -> Splats:

@@ -40,7 +40,6 @@ def _results() -> Iterator[NDArray[Any]]:
     arrays, settings = arrays_of(ball), RasterSettings(antialiased=False)
     raster, view = _core.Rasterizer(), view_of(views, 0, settings)
     raster.forward(arrays, view, settings, [0.0, 0.0, 0.0])
-    yield np.array(raster.pose_gradient(arrays, image))
     yield from raster.backward(arrays, image)
     objective: Any = SimpleNamespace(settings=settings, background=(0.0, 0.0, 0.0), ssim_weight=0.2)
     trainer = _core.Trainer(arrays, objective)

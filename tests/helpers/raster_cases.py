@@ -70,14 +70,13 @@ def oracle(
     background: Any,
     *,
     grad: bool = False,
-    pose: torch.Tensor | None = None,
     clip_margin: float = 1e-4,
 ) -> tuple[reference.Oracle, list[torch.Tensor]]:
-    """Return the naive render of a scene from its first view, or from another pose, and the tensors."""
+    """Return the naive render of a scene from its first view, and the tensors."""
     tensors = [torch.from_numpy(p[k].astype(np.float64)).requires_grad_(grad) for k in NAMES]
     out = reference.render(
         *tensors,
-        viewmat=torch.from_numpy(cameras.viewmats[0]) if pose is None else pose,
+        viewmat=torch.from_numpy(cameras.viewmats[0]),
         K=torch.from_numpy(cameras.Ks[0]),
         width=int(cameras.widths[0]),
         height=int(cameras.heights[0]),

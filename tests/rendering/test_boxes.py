@@ -6,17 +6,16 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from hypothesis import example, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from g2ard.errors import InputError
 from g2ard.io import read_splats
-from g2ard.rendering.boxes import FAINT, BoxVisibility, Canvas, front_to_back, reaching
+from g2ard.rendering.boxes import FAINT, Canvas, front_to_back, reaching
 from g2ard.rendering.renderer import RasterSettings, Rendered, Renderer, settings_for
 from g2ard.scene.cameras import Camera, Cameras, look_at
 from g2ard.scene.kdtree import KdTree, cut_tree
-from g2ard.scene.prepared import as_prepared
 from g2ard.scene.splats import Splats
 from helpers.raster_cases import VARIANTS, camera, scene, splats_of
 from helpers.realdata import real
@@ -35,7 +34,7 @@ def cut(splats: Splats, boxes: int) -> KdTree:
 def drawn(splats: Splats, tree: KdTree, view: Camera, settings: RasterSettings | None = None) -> Canvas:
     """Draw every box from the rows that reach it."""
     settings = settings_for(splats.means, settings)
-    canvas = Canvas.blank(view, depths=True)
+    canvas = Canvas.blank(view)
     boxes = tree.boxes()
     for leaf in front_to_back(tree, view.position):
         rows = reaching(splats, Cameras.of([view]), boxes[leaf])
@@ -43,10 +42,8 @@ def drawn(splats: Splats, tree: KdTree, view: Camera, settings: RasterSettings |
     return canvas
 
 
-def assert_same_image(got: Rendered, want: Rendered) -> None:
-    for name in ("image", "alpha", "depth", "median"):
-        a, b = getattr(got, name), getattr(want, name)
-        np.testing.assert_allclose(a, b, rtol=0, atol=1e-5, err_msg=name)
+def assert_same_image(canvas: Canvas, want: Rendered) -> None:
+    np.testing.assert_allclose(canvas.finished(), np.dstack([want.image, want.alpha]), rtol=0, atol=1e-5)
 
 
 def poses(rng: np.random.Generator, tree: KdTree) -> list[NDArray[np.float64]]:
@@ -81,46 +78,10 @@ def test_boxes_draw_what_the_whole_scene_draws(seed: int, boxes: int, variant: s
     tree = cut(splats, boxes)
     focal = float(rng.uniform(20, 90))
     for view in views_at(poses(rng, tree), (49, 35), focal):
-        whole = Renderer(splats, settings=VARIANTS[variant]).render(view, median=True)
+        whole = Renderer(splats, settings=VARIANTS[variant]).render(view)
         canvas = drawn(splats, tree, view, VARIANTS[variant])
-        assert_same_image(canvas.finished(), whole)
+        assert_same_image(canvas, whole)
         np.testing.assert_array_equal(canvas.color, whole.image)  # nothing is rounded twice
-
-
-def apart(splats: Splats, view: Camera) -> bool:
-    """Return whether no two Gaussians have the same depth in float32."""
-    depths = np.sort(splats.means.astype(np.float64) @ view.viewmat[2, :3] + view.viewmat[2, 3])
-    return bool((np.diff(depths) > 1e-6 * np.abs(depths[1:])).all())
-
-
-@example(seed=19, boxes=17)  # two are at one depth in the view from afar
-@given(seed=st.integers(0, 10_000), boxes=BOXES)
-@settings(max_examples=15, deadline=None)
-def test_boxes_see_what_the_whole_scene_sees(seed: int, boxes: int) -> None:
-    rng = np.random.default_rng(seed)
-    splats = splats_of(scene(seed, 400, 0, size=float(rng.choice([0.02, 0.2]))))
-    tree = cut(splats, boxes)
-    # Equal depths are drawn in Morton order, which is another in each box.
-    views = Cameras.of(view for view in views_at(poses(rng, tree), (49, 35), 40.0) if apart(splats, view))
-    conventions = RasterSettings(near=0.01, antialiased=False)
-    whole = BoxVisibility(splats)
-    for view in views:
-        whole.add(view, np.ones((35, 49), np.float32), NO_CUT, conventions)
-    rows = [np.flatnonzero(reaching(splats, views, box)) for box in tree.boxes()]
-    parts = [BoxVisibility(splats.take(some)) for some in rows]
-    for view in views:
-        light = np.ones((35, 49), np.float32)
-        for leaf in front_to_back(tree, view.position):
-            parts[leaf].add(view, light, tree.boxes()[leaf], conventions)
-    weight, pixel_size = np.zeros(400, np.float32), np.full(400, np.inf, np.float32)
-    for some, part in zip(rows, parts, strict=True):
-        own_weight, own_size = part.by_row()
-        weight[some] += own_weight
-        pixel_size[some] = own_size
-    want_weight, want_size = whole.by_row()
-    np.testing.assert_allclose(weight, want_weight, rtol=1e-5, atol=1e-5)
-    seen = np.isfinite(pixel_size)
-    np.testing.assert_array_equal(pixel_size[seen], want_size[seen])
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -133,7 +94,7 @@ def test_a_box_is_the_oracle_s(seed: int) -> None:
     box[1, rng.integers(3)] = np.inf
     front = rng.uniform(0, 1, (36, 48)).astype(np.float32)
     front[rng.random((36, 48)) < 0.2] = 1e-5
-    canvas = replace(Canvas.blank(cameras[0], depths=True), light=front.copy())
+    canvas = replace(Canvas.blank(cameras[0]), light=front.copy())
     canvas.draw(Renderer(splats_of(p), settings=RasterSettings(near=0.01)), box)
     double = [
         torch.from_numpy(p[name].astype(np.float64))
@@ -151,15 +112,9 @@ def test_a_box_is_the_oracle_s(seed: int) -> None:
     sure = ~want.doubtful.numpy()
     assert sure.mean() > 0.9
     assert want.weight.count_nonzero() > 50
-    got = canvas.finished()
-    for name in ("image", "alpha", "depth"):
-        error = np.abs(getattr(got, name) - getattr(want, name).numpy())[sure]
-        assert error.max() < 1e-5 * max(1.0, float(getattr(want, name).abs().max())), name
-    # The same pairs, weighted for visibility: Σ αT².
-    seen = BoxVisibility(splats_of(p))
-    seen.add(cameras[0], front.copy(), box, RasterSettings(near=0.01, antialiased=False))
-    squared = (want.weight * want.before).sum(1).numpy()
-    np.testing.assert_allclose(seen.by_row()[0], squared, rtol=1e-4, atol=2e-2)
+    expected = np.dstack([want.image.numpy(), want.alpha.numpy()])
+    error = np.abs(canvas.finished() - expected)[sure]
+    assert error.max() < 1e-5 * max(1.0, np.abs(expected).max())
 
 
 def playbot() -> Splats:
@@ -181,9 +136,9 @@ def test_boxes_of_playbot_draw_the_whole(boxes: int) -> None:
     views = views_at([look_at(eye, middle + 0.01 * size) for eye in eyes], (160, 120), 150.0)
     lit = 0
     for view in views:
-        whole = Renderer(splats).render(view, median=True)
+        whole = Renderer(splats).render(view)
         canvas = drawn(splats, tree, view)
-        assert_same_image(canvas.finished(), whole)
+        assert_same_image(canvas, whole)
         lit += (whole.alpha > 0.5).mean() > 0.01
     assert lit >= 3
 
@@ -201,10 +156,10 @@ def test_the_rows_that_reach_a_box_are_all_it_needs() -> None:
         for view in views:
             images = []
             for rows in (some, slice(None)):
-                canvas = Canvas.blank(view, depths=True)
+                canvas = Canvas.blank(view)
                 canvas.draw(Renderer(splats.take(rows), settings=RasterSettings(near=0.01)), box)
                 images.append(canvas)
-            for name in ("color", "light", "depth", "median"):
+            for name in ("color", "light"):
                 np.testing.assert_array_equal(getattr(images[0], name), getattr(images[1], name))
 
 
@@ -240,18 +195,6 @@ def test_light_on_hidden_boxes_is_less_than_faint() -> None:
     assert Canvas.blank(view).light_on(aside) == 0
 
 
-def test_medians_alone_are_those_beside_depths() -> None:
-    splats, tree, view = wall_and_ball()
-    beside = Canvas.blank(view, depths=True)
-    alone = replace(Canvas.blank(view, depths=True), depth=None)
-    for box in tree.boxes():
-        for canvas in (beside, alone):
-            canvas.draw(Renderer(splats), box)
-    assert beside.median is not None
-    assert beside.median.any()
-    np.testing.assert_array_equal(alone.median, beside.median)
-
-
 def test_boxes_give_the_same_bits_on_any_number_of_threads() -> None:
     splats = splats_of(scene(2, 3000, 1, size=0.05))
     tree = cut(splats, 5)
@@ -259,14 +202,7 @@ def test_boxes_give_the_same_bits_on_any_number_of_threads() -> None:
 
     def everything() -> list[Any]:
         canvas = drawn(splats, tree, view)
-        seen = BoxVisibility(splats)
-        seen.add(
-            view,
-            np.ones((110, 150), np.float32),
-            tree.boxes()[1],
-            RasterSettings(near=0.01, antialiased=False),
-        )
-        return [canvas.color, canvas.light, canvas.depth, canvas.median, *seen.by_row()]
+        return [canvas.color, canvas.light]
 
     first, *others = on_threads(everything)
     for other in others:
@@ -288,7 +224,3 @@ def test_bad_boxes_and_planes_are_named() -> None:
         small.draw(renderer, NO_CUT)
     with pytest.raises(InputError, match="light"):
         small.light_on(NO_CUT)
-    with pytest.raises(InputError, match="light"):
-        BoxVisibility(as_prepared(splats)).add(
-            view, small.light, NO_CUT, RasterSettings(near=0.01, antialiased=False)
-        )

@@ -152,7 +152,6 @@ def greedy(
         cells.parts,
         (starts, seen, np.ascontiguousarray(cameras.recentred(cells.origin).positions)),
         len(cameras),
-        directional=True,
         config=options,
         progress=counter(progress, "select"),
     )

@@ -3,8 +3,8 @@
 use g2ard_core::Result;
 use g2ard_core::raster::simd::Isa;
 use g2ard_core::raster::{
-    Accumulated, Bounds, Camera, Canvas, Gradients, Image, ImageGradients, Params, PoseGradient,
-    Rasterizer, Settings, light_on as core_light_on, reaching as core_reaching,
+    Accumulated, Bounds, Camera, Canvas, Gradients, Image, ImageGradients, Params, Rasterizer,
+    Settings, light_on as core_light_on, reaching as core_reaching,
 };
 use numpy::{
     IntoPyArray, PyArray1, PyArrayMethods, PyReadonlyArray1, PyReadonlyArray2, PyReadonlyArrayDyn,
@@ -14,7 +14,6 @@ use pyo3::prelude::*;
 use pyo3::types::PyDict;
 use rayon::prelude::*;
 use std::sync::{Mutex, PoisonError};
-use std::thread::{self, ThreadId};
 
 use crate::arrays::{self, flat, optional, writable};
 use crate::device::{self, Drawn};
@@ -93,23 +92,15 @@ pub fn instruction_sets() -> Vec<&'static str> {
     Isa::available().into_iter().map(Isa::name).collect()
 }
 
-/// The planes of a canvas: color (H, W, 3), light, depth and median (H, W).
+/// The planes of a canvas: color (H, W, 3) and light (H, W).
 #[derive(FromPyObject)]
-pub struct Planes<'py>(
-    PyReadwriteArrayDyn<'py, f32>,
-    PyReadwriteArrayDyn<'py, f32>,
-    Option<PyReadwriteArrayDyn<'py, f32>>,
-    Option<PyReadwriteArrayDyn<'py, f32>>,
-);
+pub struct Planes<'py>(PyReadwriteArrayDyn<'py, f32>, PyReadwriteArrayDyn<'py, f32>);
 
 impl Planes<'_> {
     fn canvas(&mut self) -> PyResult<Canvas<'_>> {
-        let plane = |name, plane: Option<_>| plane.map(|p| writable(name, p)).transpose();
         Ok(Canvas {
             rgb: writable("color", &mut self.0)?,
             light: writable("light", &mut self.1)?,
-            depth: plane("depth", self.2.as_mut())?,
-            median: plane("median", self.3.as_mut())?,
         })
     }
 }
@@ -120,23 +111,11 @@ pub struct PyRasterizer(Mutex<Rendering>);
 
 struct Rendering {
     inner: Rasterizer,
-    /// The thread of the last forward pass.
-    thread: ThreadId,
     /// The scene that `image` drew last, and what a device keeps of it.
     scene: Option<(Py<PyAny>, Drawn)>,
-    /// The last image if a device drew it, without the forward pass that gradients need.
-    elsewhere: Option<(Camera, Settings, [f32; 3])>,
 }
 
 impl Rendering {
-    /// Repeat the last forward pass on the CPU if it was a device's.
-    fn bring_back(&mut self, params: &Params) -> Result<()> {
-        if let Some((camera, settings, background)) = self.elsewhere.take() {
-            self.here(params, &camera, &settings, background)?;
-        }
-        Ok(())
-    }
-
     /// Draw an image on the CPU.
     fn here(
         &mut self,
@@ -177,14 +156,12 @@ impl PyRasterizer {
     fn new(isa: Option<&str>) -> PyResult<Self> {
         Ok(Self(Mutex::new(Rendering {
             inner: Rasterizer::new(isa_named(isa)?),
-            thread: thread::current().id(),
             scene: None,
-            elsewhere: None,
         })))
     }
 
     /// Return the image (H, W, 3) alone, drawn by the device in use. A device keeps the scene while the same tuple of
-    /// arrays is passed, whose values must not change.
+    /// arrays is passed, whose values must not change. A backward pass needs `forward`.
     #[pyo3(signature = (scene, view, options, background, bounds = None))]
     fn image<'py>(
         &self,
@@ -206,18 +183,13 @@ impl PyRasterizer {
             Some((same, drawn)) if same.is(scene) => drawn,
             _ => Drawn::default(),
         };
-        let (rgb, elsewhere) = work::quick(py, || {
-            let there = device::image(&mut drawn, &params, &camera, &settings, background)?;
-            let elsewhere = there.is_some();
-            let rgb = match there {
-                Some(rgb) => rgb,
-                None => rendering.here(&params, &camera, &settings, background)?,
-            };
-            Ok((rgb, elsewhere))
+        let rgb = work::quick(py, || {
+            match device::image(&mut drawn, &params, &camera, &settings, background)? {
+                Some(rgb) => Ok(rgb),
+                None => rendering.here(&params, &camera, &settings, background),
+            }
         })?;
         rendering.scene = Some((scene.clone().unbind(), drawn));
-        rendering.thread = thread::current().id();
-        rendering.elsewhere = elsewhere.then_some((camera, settings, background));
         PyArray1::from_vec(py, rgb).reshape([camera.height, camera.width, 3])
     }
 
@@ -259,8 +231,6 @@ impl PyRasterizer {
             inner.forward(&params, &camera, &settings, background, &mut image)?;
             Ok((rgb, alpha, depth, median))
         })?;
-        rendering.thread = thread::current().id();
-        rendering.elsewhere = None;
         let shape = [height, width];
         Ok((
             PyArray1::from_vec(py, rgb).reshape([height, width, 3])?,
@@ -270,7 +240,7 @@ impl PyRasterizer {
         ))
     }
 
-    /// Draw a box of the scene behind what the planes (color, light, depth, median) show, in place.
+    /// Draw a box of the scene behind what the planes (color, light) show, in place.
     #[pyo3(signature = (arrays, view, options, corners, planes, bounds = None))]
     #[expect(clippy::too_many_arguments, reason = "Python's signature")]
     fn draw(
@@ -291,8 +261,6 @@ impl PyRasterizer {
         work::quick(py, || {
             inner.draw(&params, &camera, &settings, &region, &mut canvas)
         })?;
-        rendering.thread = thread::current().id();
-        rendering.elsewhere = None;
         Ok(())
     }
 
@@ -333,7 +301,6 @@ impl PyRasterizer {
                 sh0,
                 sh_n,
             };
-            rendering.bring_back(&params)?;
             (rendering.inner).backward(&params, &gradients, &mut rows)?;
             Ok(out)
         })?;
@@ -344,31 +311,6 @@ impl PyRasterizer {
             .zip(shapes)
             .map(|(values, like)| PyArray1::from_vec(py, values).reshape(like.shape().to_vec()))
             .collect()
-    }
-
-    /// Return dL/d(v, ω) of the last forward pass's pose T, T ← exp(v, ω)·T, from dL/d(image).
-    fn pose_gradient<'py>(
-        &self,
-        py: Python<'py>,
-        arrays: Arrays<'py>,
-        image: Floats<'py>,
-    ) -> PyResult<PoseGradient> {
-        let params = arrays.params()?;
-        let gradients = ImageGradients {
-            rgb: flat("image gradient", &image)?,
-            alpha: None,
-            depth: None,
-        };
-        let mut rendering = work::locked(py, &self.0);
-        if rendering.thread != thread::current().id() {
-            let expected = "a render before it in the same thread";
-            return Err(invalid("pose gradient", expected, "another thread's"));
-        }
-        let rendering = &mut *rendering;
-        work::quick(py, || {
-            rendering.bring_back(&params)?;
-            rendering.inner.pose_gradient(&params, &gradients)
-        })
     }
 }
 

@@ -140,13 +140,12 @@ type Views<'py> = (
 
 /// Return (views, gains, evaluations) of greedy maximisation.
 #[pyfunction]
-#[pyo3(signature = (surface, views, k, directional, config, progress=None))]
+#[pyo3(signature = (surface, views, k, config, progress=None))]
 pub fn select_greedy<'py>(
     py: Python<'py>,
     surface: Surfaces<'py>,
     views: Views<'py>,
     k: usize,
-    directional: bool,
     config: Config<Coverage>,
     progress: Option<&Bound<'py, PyAny>>,
 ) -> PyResult<Choice<'py>> {
@@ -162,7 +161,6 @@ pub fn select_greedy<'py>(
         surface: &surface,
         visible: &visible.ok_or_else(offsets)?,
         positions: arrays::rows("positions", &views.2)?,
-        directional,
     };
     let chosen = long(py, progress, |control| {
         problem.greedy(k, &config.0, control)

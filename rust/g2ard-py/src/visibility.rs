@@ -3,14 +3,13 @@
 use std::sync::{Arc, Mutex};
 
 use g2ard_core::raster::visibility::{VisibilityAccumulator, VisibilityKernels};
-use numpy::{PyArray1, PyReadwriteArrayDyn};
+use numpy::PyArray1;
 use pyo3::prelude::*;
 
-use crate::arrays::writable;
 use crate::device::{Kernels, kernels};
 use crate::scene::PyScene;
-use crate::views::{Corners, RasterOptions, View};
-use crate::work::{locked, long, quick};
+use crate::views::{RasterOptions, View};
+use crate::work::{locked, long};
 
 /// Calls from several threads take turns.
 #[pyclass(name = "VisibilityAccumulator", module = "g2ard._core", frozen)]
@@ -51,22 +50,6 @@ impl PyVisibilityAccumulator {
             kernels.add_views(sums, &cameras, &settings, control)?;
             Ok(sums.seen())
         })
-    }
-
-    /// Add what a box contributes to a view behind `light`, (H, W), which becomes the light behind the box.
-    fn add_box(
-        &self,
-        py: Python<'_>,
-        view: View,
-        options: RasterOptions,
-        corners: Corners,
-        mut light: PyReadwriteArrayDyn<'_, f32>,
-    ) -> PyResult<()> {
-        let (camera, settings, region) = (view.camera(), options.settings()?, corners.into());
-        let light = writable("light", &mut light)?;
-        let mut sums = locked(py, &self.sums);
-        let sums = &mut *sums;
-        quick(py, || sums.add_box(&camera, &settings, &region, light))
     }
 
     /// Return (N,) Σ αT² and (N,) the smallest size of a pixel, ∞ if no view contains the mean.

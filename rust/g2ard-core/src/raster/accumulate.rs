@@ -9,7 +9,6 @@ use super::disjoint::DisjointSlice;
 use super::grid::TileRect;
 use super::params::Params;
 use super::project::Splat;
-use super::region::Within;
 use super::simd::{Kernel, LANES, Lanes, Lanes16, Mask, Real, Vector};
 use super::tile_batch::{TileBatch, alpha, block_coordinates, log2_alpha};
 use super::{ALPHA_MIN, Camera, ROWS, Settings};
@@ -96,20 +95,17 @@ struct Row {
 }
 
 /// Blends one tile from front to back without an image: only every pair's `KINDS` sums, each in its own slot.
-pub struct Accumulate<'a, W: Within, const KINDS: usize> {
+pub struct Accumulate<'a, const KINDS: usize> {
     pub pairs: &'a [Pair],
     pub splats: &'a [Splat],
     pub rect: TileRect,
     pub settings: &'a Settings,
-    /// The light in front of the first pair, and after the call behind the last; see the forward kernel.
-    pub light: &'a mut [Lanes16; ROWS],
-    pub within: W,
     pub tile_batch: &'a mut TileBatch,
     pub slots: DisjointSlice<'a, [f32; KINDS]>,
     pub written: DisjointSlice<'a, u8>,
 }
 
-impl<W: Within, const KINDS: usize> Kernel for Accumulate<'_, W, KINDS> {
+impl<const KINDS: usize> Kernel for Accumulate<'_, KINDS> {
     type Output = ();
 
     #[inline(always)]
@@ -122,8 +118,8 @@ impl<W: Within, const KINDS: usize> Kernel for Accumulate<'_, W, KINDS> {
             most: Lanes16::default(),
             winner: Lanes16([-1.0; LANES]),
         }; ROWS];
-        for (row, light) in rows.iter_mut().zip(&*self.light) {
-            row.unstopped = *light;
+        for (row, light) in rows.iter_mut().zip(self.rect.light()) {
+            row.unstopped = light;
         }
         let mut block_masks = [0; MOST_BLOCKS];
         let mut lit = (u64::MAX >> (64 - blocks::<F::Block>())) as u32;
@@ -147,9 +143,6 @@ impl<W: Within, const KINDS: usize> Kernel for Accumulate<'_, W, KINDS> {
                     let (x, y) = block_coordinates::<F::Block>(b);
                     let (_, _, log2) = log2_alpha(&s.splats[p], x, y);
                     let hit = log2.ge(minimum);
-                    let hit = self
-                        .within
-                        .at::<F::Block>(hit, s.splats[p].depth, b_row, part);
                     let a = alpha(log2).min(clip).only(hit);
                     let t = F::Block::load_part(&row.unstopped, part);
                     let next = a.fnma(t, t);
@@ -187,9 +180,6 @@ impl<W: Within, const KINDS: usize> Kernel for Accumulate<'_, W, KINDS> {
             if lit == 0 {
                 break;
             }
-        }
-        for (row, light) in rows.iter().zip(&mut *self.light) {
-            *light = row.unstopped;
         }
         for number in rows.iter().flat_map(|row| row.winner.0) {
             if KINDS == ALL && number >= 0.0 {

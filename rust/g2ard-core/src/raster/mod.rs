@@ -3,7 +3,7 @@
 //! [`project`] turns 16 Gaussians at a time into screen splats, and [`tile_lists`] lists the 16×16 tiles that each one's
 //! ellipse at α = 1/255 meets; [`depth_sort`] sorts them by depth once; [`bins`] scatters them stably into their tiles;
 //! [`tile_batch`] holds a tile's pairs in the tile's coordinates; [`forward`] blends each tile, 4×4 or 4×2 pixels to a register; [`backward`] walks the same pairs from back to front, each pair summing into its own slot; [`gradients`]
-//! adds a Gaussian's slots in order and goes back through the projection, [`pose`] to the camera. No atomics: the bits do not depend on threads.
+//! adds a Gaussian's slots in order and goes back through the projection. No atomics: the bits do not depend on threads.
 //!
 //! Conventions (gsplat's by default): pixel centres at +0.5; 0.3 px² dilation; α = min(0.99, opacity·exp(−q)); α < 1/255
 //! is skipped; a pixel stops before its transmittance would fall to 1e-4; colour = max(0, 0.5 + SH).
@@ -22,7 +22,6 @@ pub(crate) mod gradients;
 pub(crate) mod grid;
 pub(crate) mod memory;
 pub(crate) mod params;
-mod pose;
 pub(crate) mod project;
 pub(crate) mod rasterizer;
 mod region;
@@ -38,7 +37,6 @@ pub use accumulate::Accumulated;
 pub use bounds::Bounds;
 pub use gradients::Gradients;
 pub use params::Params;
-pub use pose::PoseGradient;
 pub use rasterizer::{Canvas, Image, ImageGradients, Rasterizer};
 pub use region::{Region, light_on, reaching};
 pub use simd::Isa;

@@ -11,9 +11,7 @@ use super::{ALPHA_MIN, Camera, Convention, DILATION, Settings};
 use jacobian::{Jacobian, axes_on_screen, in_camera, scales};
 
 pub use screen::Project;
-pub use unproject::{
-    RowGradients, ScreenGradients, quaternion_gradient, unproject, unproject_to_pose,
-};
+pub use unproject::{RowGradients, ScreenGradients, quaternion_gradient, unproject};
 
 /// ½·log2(e): exponents are kept in powers of two, so exp(−½ dᵀΣ₂⁻¹d) = 2^−(u² + v²).
 pub const HALF_LOG2_E: f32 = 0.5 * LOG2_E;

@@ -2,7 +2,6 @@
 
 mod accumulated;
 mod boxed;
-mod posed;
 #[cfg(test)]
 mod tests;
 mod tiled;
@@ -30,7 +29,6 @@ use super::tile_lists::{TileIntersector, TileList};
 use super::{Camera, ROWS, Settings};
 use crate::{Error, Result};
 
-pub(crate) use accumulated::Behind;
 pub use boxed::Canvas;
 pub use views::{Image, ImageGradients};
 
@@ -131,7 +129,7 @@ impl Rasterizer {
     ) -> Result<()> {
         params.validate()?;
         out.validate(params)?;
-        self.check_rendered("backward", params.len(), image)?;
+        self.check_rendered(params.len(), image)?;
         let out = out.row_major(params.sh_coeffs);
         if image.depth.is_some() {
             self.backward_tiles::<true>(image);
@@ -156,14 +154,13 @@ impl Rasterizer {
     }
 
     /// Check that the last forward pass rendered as many rows, in an image of this size.
-    fn check_rendered(
-        &self,
-        name: &'static str,
-        rows: usize,
-        image: &ImageGradients,
-    ) -> Result<()> {
+    fn check_rendered(&self, rows: usize, image: &ImageGradients) -> Result<()> {
         let Some(state) = &self.state else {
-            return Err(Error::invalid(name, "a forward pass before it", "none"));
+            return Err(Error::invalid(
+                "backward",
+                "a forward pass before it",
+                "none",
+            ));
         };
         Error::unless_equal("rows", rows, state.rows, "rows")?;
         image.validate(&state.camera)

@@ -63,8 +63,6 @@ pub struct Problem<'a> {
     pub visible: &'a [Vec<u32>],
     /// Each view's camera centre.
     pub positions: &'a [[f64; 3]],
-    /// Whether cells count as seen from the directions that their normals ask for, or from anywhere.
-    pub directional: bool,
 }
 
 impl Problem<'_> {
@@ -91,11 +89,7 @@ struct State<'a> {
 
 impl<'a> State<'a> {
     fn new(problem: Problem<'a>, coverage: Coverage) -> Self {
-        let anchors = if problem.directional {
-            sphere(coverage.anchors)
-        } else {
-            vec![[0.0, 0.0, 1.0]]
-        };
+        let anchors = sphere(coverage.anchors);
         let targets: Vec<f64> = problem
             .surface
             .normals
@@ -115,9 +109,6 @@ impl<'a> State<'a> {
     /// Calls `f(index of (cell, anchor), ν·η·φ)` for all that `view` adds to a cell.
     fn observe(&self, view: usize, cell: u32, mut f: impl FnMut(usize, f64)) {
         let (j, count) = (cell as usize, self.anchors.len());
-        if !self.problem.directional {
-            return f(j, 1.0);
-        }
         let surface = self.problem.surface;
         let to = sub(self.problem.positions[view], surface.centers[j]);
         let length = dot(to, to).sqrt();
@@ -281,7 +272,6 @@ mod tests {
             surface: &surface,
             visible: &visible,
             positions: &positions,
-            directional: true,
         };
         let coverage = Coverage::default();
         let anchors = sphere(coverage.anchors);

@@ -190,6 +190,7 @@ fn difference<T: Real>(a: &[T; 3], b: &[T; 3]) -> [T; 3] {
 
 impl Node {
     /// Completes a node whose mean, covariance, dilation and α are set: areas and mass.
+    #[cfg(test)]
     pub fn weighed(mut self) -> Self {
         (self.areas, self.mass) = (self.areas_of(), self.mass_of());
         self

@@ -247,6 +247,7 @@ impl Gpu {
     }
 
     /// Lose the device, as after a driver's reset.
+    #[cfg(test)]
     pub fn lose(&self) {
         self.device.destroy();
     }

@@ -1,6 +1,6 @@
 //! Back through the projection: from a splat's gradient to the stored parameters'.
 
-use super::{HALF_LOG2_E, INRIA_FLOOR, Projected, View, colour, cross, direction, dot, project};
+use super::{HALF_LOG2_E, INRIA_FLOOR, Projected, View, colour, direction, dot, project};
 use crate::raster::params::Source;
 use crate::raster::simd::Lanes;
 use crate::raster::{Convention, DILATION, sh};
@@ -53,8 +53,6 @@ struct Geometry<F: Lanes> {
     log_scale: [F; 3],
     /// dL/d(the Gaussian's rotation).
     dr: [[F; 3]; 3],
-    /// dL/d(J·W).
-    djw: [[F; 3]; 2],
     /// dL/d(mean), in the camera's axes.
     camera: [F; 3],
 }
@@ -114,7 +112,6 @@ fn geometry<F: Lanes, S: Source>(
         p,
         log_scale,
         dr,
-        djw,
         camera,
     }
 }
@@ -132,7 +129,6 @@ pub fn unproject<F: Lanes, S: Source>(
         log_scale,
         dr,
         camera,
-        ..
     } = geometry(view, source, group, g);
     let quat = quaternion_gradient(&p.q, p.rq, &dr);
     let mut mean = [F::zero(); 3];
@@ -149,30 +145,6 @@ pub fn unproject<F: Lanes, S: Source>(
         rgb,
         extent: Extent::of(&p.m, p.depth.ge(F::splat(view.near))),
     }
-}
-
-/// One group's share of dL/dξ, ξ = (v, ω) and T ← exp(ξ)·T for the camera_from_world T = [W | t]:
-/// v moves the mean as seen from the camera, and the direction it is seen from; ω turns mean and covariance about the
-/// camera, X × dL/dX + Σᵢ W·(dL/djwᵢ × jwᵢ) with jw the rows of J·W, and leaves that direction as it is.
-#[inline(always)]
-pub fn unproject_to_pose<F: Lanes, S: Source>(
-    view: &View,
-    source: &S,
-    group: usize,
-    g: &ScreenGradients<F>,
-) -> [F; 6] {
-    let Geometry { p, djw, camera, .. } = geometry(view, source, group, g);
-    let mut seen = [F::zero(); 3];
-    through_colour(view, source, group, g.rgb, &mut seen);
-    let at = [p.ray[0] * p.depth, p.ray[1] * p.depth, p.depth];
-    let turn = cross(&at, &camera);
-    let rows = [cross(&djw[0], &p.jw[0]), cross(&djw[1], &p.jw[1])];
-    let mut out = [F::zero(); 6];
-    for k in 0..3 {
-        out[k] = camera[k] + dot(&p.w[k], &seen);
-        out[k + 3] = turn[k] + dot(&p.w[k], &rows[0]) + dot(&p.w[k], &rows[1]);
-    }
-    out
 }
 
 /// Add to dL/d(mean) the part that comes through the colour's direction. Return the SH basis, and dL/d(colour) where

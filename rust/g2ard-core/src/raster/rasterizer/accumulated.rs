@@ -3,7 +3,6 @@
 use rayon::prelude::*;
 
 use super::Rasterizer;
-use super::boxed::{load_light, pairs_within, store_light};
 use super::tiled::MOST_TILES;
 use crate::Result;
 use crate::raster::accumulate::{ALL, Accumulate, Accumulated, SharedSums, Total, smallest_pixels};
@@ -11,16 +10,9 @@ use crate::raster::disjoint::DisjointSlice;
 use crate::raster::grid::TileGrid;
 use crate::raster::memory;
 use crate::raster::params::{Params, Source};
-use crate::raster::region::{Everywhere, Rays, Region};
 use crate::raster::simd::dispatch;
 use crate::raster::tile_batch::TileBatch;
 use crate::raster::{Camera, Settings};
-
-/// A box, and the light in front of it at every pixel: at most the smallest where the pixel has stopped.
-pub(crate) struct Behind<'a> {
-    pub region: &'a Region,
-    pub light: &'a mut [f32],
-}
 
 impl Rasterizer {
     /// Renders a view without an image and adds what every Gaussian contributes to it.
@@ -47,7 +39,6 @@ impl Rasterizer {
             camera,
             settings,
             TileGrid::of(camera),
-            None,
             |row, total| {
                 // SAFETY: the call comes once for every row.
                 unsafe { rows.add(row, &total) };
@@ -57,8 +48,6 @@ impl Rasterizer {
         Ok(())
     }
 
-    /// The sums of the pairs in a box, if one is given; its light then is that behind the box afterwards.
-    ///
     /// Calls `visit(row, its sums)` once for every row that may touch the grid's part of the view's image, in parallel.
     pub(crate) fn accumulate_from<const KINDS: usize, S: Source>(
         &mut self,
@@ -66,11 +55,10 @@ impl Rasterizer {
         camera: &Camera,
         settings: &Settings,
         grid: TileGrid,
-        behind: Option<&mut Behind>,
         visit: impl Fn(usize, Total) + Sync,
     ) -> Result<()> {
         self.prepare(source, camera, settings, [0.0; 3], grid)?;
-        self.accumulate_tiles::<KINDS>(behind);
+        self.accumulate_tiles::<KINDS>();
         let shares = self.shares.as_chunks::<KINDS>().0;
         self.visible().for_each(|(splats, slots)| {
             let (shares, written) = (&shares[slots.clone()], &self.written[slots]);
@@ -82,7 +70,7 @@ impl Rasterizer {
         Ok(())
     }
 
-    fn accumulate_tiles<const KINDS: usize>(&mut self, behind: Option<&mut Behind>) {
+    fn accumulate_tiles<const KINDS: usize>(&mut self) {
         let pairs = self.bins.len();
         let shares = memory::first(&mut self.shares, pairs * KINDS);
         memory::first(&mut self.written, pairs).fill(0);
@@ -96,48 +84,18 @@ impl Rasterizer {
         let tiles = (0..self.batches.len())
             .into_par_iter()
             .with_max_len(MOST_TILES);
-        let Some(behind) = behind else {
-            tiles.for_each_init(TileBatch::default, |tile_batch, tile| {
-                let rect = grid.rect(tile, camera);
-                let accumulate = Accumulate {
-                    pairs: bins.pairs_of(tile),
-                    splats,
-                    rect,
-                    settings,
-                    light: &mut rect.light(),
-                    within: Everywhere,
-                    tile_batch,
-                    slots,
-                    written,
-                };
-                dispatch(isa, accumulate);
-            });
-            return;
-        };
-        let (region, rays) = (behind.region, Rays::of(camera));
-        let plane = DisjointSlice::new(&mut *behind.light);
         tiles.for_each_init(TileBatch::default, |tile_batch, tile| {
             let rect = grid.rect(tile, camera);
-            let pairs = bins.pairs_of(tile);
-            let Some((pairs, ranges)) = pairs_within(pairs, splats, region, &rays, &rect) else {
-                return;
-            };
-            // SAFETY: every tile has its own pixels.
-            let mut light = unsafe { load_light(plane, camera.width, &rect) };
             let accumulate = Accumulate {
-                pairs,
+                pairs: bins.pairs_of(tile),
                 splats,
                 rect,
                 settings,
-                light: &mut light,
-                within: &ranges,
                 tile_batch,
                 slots,
                 written,
             };
             dispatch(isa, accumulate);
-            // SAFETY: as above.
-            unsafe { store_light(&light, plane, camera.width, &rect) };
         });
     }
 }

@@ -23,21 +23,14 @@ pub struct Canvas<'a> {
     pub rgb: &'a mut [f32],
     /// The light that is left, negated where the pixel has stopped.
     pub light: &'a mut [f32],
-    /// Σ αT·z.
-    pub depth: Option<&'a mut [f32]>,
-    /// Depth of the splat at which the light falls below one half; 0 as long as it does not.
-    pub median: Option<&'a mut [f32]>,
 }
 
 impl Canvas<'_> {
     fn validate(&self, camera: &Camera) -> Result<()> {
         let pixels = camera.width * camera.height;
-        let length = |plane: &Option<&mut [f32]>| plane.as_ref().map_or(pixels, |p| p.len());
         for (name, got, expected) in [
             ("color", self.rgb.len(), 3 * pixels),
             ("light", self.light.len(), pixels),
-            ("depth", length(&self.depth), pixels),
-            ("median", length(&self.median), pixels),
         ] {
             Error::unless_equal(name, got, expected, "values")?;
         }
@@ -49,8 +42,6 @@ impl Canvas<'_> {
 struct Planes<'a> {
     rgb: DisjointSlice<'a, f32>,
     light: DisjointSlice<'a, f32>,
-    depth: Option<DisjointSlice<'a, f32>>,
-    median: Option<DisjointSlice<'a, f32>>,
 }
 
 /// A tile's state between its memory and its image.
@@ -80,16 +71,12 @@ impl Rasterizer {
         region.validate()?;
         canvas.validate(camera)?;
         self.prepare(*params, camera, settings, [0.0; 3], TileGrid::of(camera))?;
-        if canvas.depth.is_some() || canvas.median.is_some() {
-            self.draw_tiles::<true>(region, canvas);
-        } else {
-            self.draw_tiles::<false>(region, canvas);
-        }
+        self.draw_tiles(region, canvas);
         self.state = None; // no state that a backward pass could use
         Ok(())
     }
 
-    fn draw_tiles<const DEPTH: bool>(&mut self, region: &Region, canvas: &mut Canvas) {
+    fn draw_tiles(&mut self, region: &Region, canvas: &mut Canvas) {
         let Some(state) = &self.state else { return };
         let (camera, grid, isa) = (&state.camera, state.grid, self.isa);
         let (bins, splats) = (&self.bins, &self.splats);
@@ -97,8 +84,6 @@ impl Rasterizer {
         let planes = Planes {
             rgb: DisjointSlice::new(canvas.rgb),
             light: DisjointSlice::new(canvas.light),
-            depth: canvas.depth.as_deref_mut().map(DisjointSlice::new),
-            median: canvas.median.as_deref_mut().map(DisjointSlice::new),
         };
         let block_masks = DisjointSlice::new(&mut self.block_masks);
         let tiles = self.batches.par_iter().enumerate();
@@ -113,7 +98,7 @@ impl Rasterizer {
                 };
                 // SAFETY: every tile has its own pixels.
                 unsafe { scratch.load(&planes, camera.width, &rect) };
-                let forward = Forward::<_, DEPTH> {
+                let forward = Forward::<_, false> {
                     pairs,
                     splats,
                     rect,
@@ -136,7 +121,7 @@ impl Rasterizer {
 }
 
 /// A tile's pairs that may lie within a box, and the box's depths at its pixels; None without pairs.
-pub(super) fn pairs_within<'a>(
+fn pairs_within<'a>(
     pairs: &'a [Pair],
     splats: &[Splat],
     region: &Region,
@@ -167,11 +152,7 @@ fn for_pixels(width: usize, rect: &TileRect, mut visit: impl FnMut(usize, usize,
 ///
 /// # Safety
 /// No other thread touches the tile meanwhile.
-pub(super) unsafe fn load_light(
-    plane: DisjointSlice<f32>,
-    width: usize,
-    rect: &TileRect,
-) -> [Lanes16; ROWS] {
+unsafe fn load_light(plane: DisjointSlice<f32>, width: usize, rect: &TileRect) -> [Lanes16; ROWS] {
     let mut light = [Lanes16::default(); ROWS];
     for_pixels(width, rect, |pixel, row, lane| {
         // SAFETY: the caller's promise; a tile's pixels lie in the image.
@@ -184,7 +165,7 @@ pub(super) unsafe fn load_light(
 ///
 /// # Safety
 /// As for [`load_light`].
-pub(super) unsafe fn store_light(
+unsafe fn store_light(
     light: &[Lanes16; ROWS],
     plane: DisjointSlice<f32>,
     width: usize,
@@ -208,12 +189,6 @@ impl Scratch {
             for_pixels(width, rect, |pixel, row, lane| {
                 for c in 0..3 {
                     self.pixels.rgb[c][row].0[lane] = *planes.rgb.at(3 * pixel + c);
-                }
-                if let Some(plane) = planes.depth {
-                    self.pixels.depth[row].0[lane] = *plane.at(pixel);
-                }
-                if let Some(plane) = planes.median {
-                    self.pixels.median[row].0[lane] = *plane.at(pixel);
                 }
             });
         }
@@ -240,12 +215,6 @@ impl Scratch {
                     planes
                         .rgb
                         .write(3 * pixel + c, self.pixels.rgb[c][row].0[lane]);
-                }
-                if let Some(plane) = planes.depth {
-                    plane.write(pixel, self.pixels.depth[row].0[lane]);
-                }
-                if let Some(plane) = planes.median {
-                    plane.write(pixel, self.pixels.median[row].0[lane]);
                 }
             });
         }

@@ -14,11 +14,10 @@ use crate::raster::disjoint::DisjointSlice;
 use crate::raster::frustum::Frustum;
 use crate::raster::grid::TileGrid;
 use crate::raster::params::check_count;
-use crate::raster::rasterizer::Behind;
 use crate::raster::simd::LANES;
-use crate::raster::{Camera, Rasterizer, Region, Settings};
+use crate::raster::{Camera, Rasterizer, Settings};
 use crate::scene::{Means, Ordered, SceneRef};
-use crate::{Control, Cpu, Error, Result};
+use crate::{Control, Cpu, Result};
 use groups::{Group, VisibleGroup, VisibleGroups};
 
 /// Kernels over a scene that views look at. An implementation may differ from [`Cpu`]'s within a stated tolerance.
@@ -132,35 +131,6 @@ impl VisibilityAccumulator {
     ///
     /// The image is drawn in bands of rows, each from the groups that it meets.
     pub fn add(&mut self, camera: &Camera, settings: &Settings) -> Result<()> {
-        self.add_behind(camera, settings, None)
-    }
-
-    /// Adds what a box of a scene contributes to a view, of which the boxes in front were added. `light` is the light in
-    /// front of the box, pixel by pixel, and becomes that behind it; below the smallest that [`Settings`] allows a pixel
-    /// has stopped. The box is in the scene's coordinates.
-    pub fn add_box(
-        &mut self,
-        camera: &Camera,
-        settings: &Settings,
-        region: &Region,
-        light: &mut [f32],
-    ) -> Result<()> {
-        region.validate()?;
-        Error::unless_equal("light", light.len(), camera.width * camera.height, "values")?;
-        let moved = |corner: [f64; 3]| [0, 1, 2].map(|k| corner[k] - self.shift[k]);
-        let region = &Region {
-            low: moved(region.low),
-            high: moved(region.high),
-        };
-        self.add_behind(camera, settings, Some(&mut Behind { region, light }))
-    }
-
-    fn add_behind(
-        &mut self,
-        camera: &Camera,
-        settings: &Settings,
-        mut behind: Option<&mut Behind>,
-    ) -> Result<()> {
         camera.validate()?;
         settings.validate()?;
         let camera = self.relative(camera);
@@ -176,7 +146,7 @@ impl VisibilityAccumulator {
                 .map(|group| group.number)
                 .collect();
             let grid = grid.with_rows(rows);
-            self.add_band(&camera, settings, grid, &in_band, behind.as_deref_mut())?;
+            self.add_band(&camera, settings, grid, &in_band)?;
         }
         Ok(())
     }
@@ -204,7 +174,6 @@ impl VisibilityAccumulator {
         settings: &Settings,
         grid: TileGrid,
         in_band: &[u32],
-        behind: Option<&mut Behind>,
     ) -> Result<()> {
         let Some(&last) = in_band.last() else {
             return Ok(());
@@ -222,7 +191,7 @@ impl VisibilityAccumulator {
             unsafe { *weight.at(row) += total.weight };
         };
         self.rasterizer
-            .accumulate_from::<SQUARED, _>(source, camera, settings, grid, behind, add)
+            .accumulate_from::<SQUARED, _>(source, camera, settings, grid, add)
     }
 
     /// Rows that some view saw.
@@ -386,7 +355,7 @@ mod tests {
             };
             let grid = TileGrid::of(&camera);
             rasterizer
-                .accumulate_from::<SQUARED, _>(params, &camera, &settings, grid, None, add)
+                .accumulate_from::<SQUARED, _>(params, &camera, &settings, grid, add)
                 .unwrap();
             let frustum = Frustum::of(&camera);
             let alone = views.bounds.iter().map(|b| b.tile_rows(&frustum).is_some());
@@ -422,41 +391,5 @@ mod tests {
             split.add(&camera, &Settings::default()).unwrap();
         }
         assert_eq!(whole.by_row(), split.by_row());
-    }
-
-    #[test]
-    fn boxes_lie_in_the_coordinates_of_the_scene() {
-        let rows = scene();
-        // The rows nearer than `face`, with everything `away` from where the test has it.
-        let nearer = |means: Means, away: f64| {
-            let mut camera = cameras()[0];
-            camera.viewmat = [0, 1, 2].map(|k| {
-                let mut row = [0.0, 0.0, 0.0, [0.1, -0.2, 3.0][k] - away];
-                row[k] = 1.0;
-                row
-            });
-            let region = Region {
-                low: [f64::NEG_INFINITY; 3],
-                high: [f64::INFINITY, f64::INFINITY, away + 0.3],
-            };
-            let scene = SceneRef {
-                means,
-                ..made(&rows)
-            };
-            let (mut sums, mut light) = (accumulator(&scene), vec![1.0; 85 * 64]);
-            sums.add_box(&camera, &Settings::default(), &region, &mut light)
-                .unwrap();
-            (sums.by_row().0, light)
-        };
-        let far: Vec<[f64; 3]> = rows
-            .0
-            .iter()
-            .map(|m| m.map(|v| f64::from(v) + 1e3))
-            .collect();
-        let (want, light) = nearer(Means::F32(&rows.0), 0.0);
-        let (got, light_far) = nearer(Means::F64(&far), 1e3);
-        assert!(want.iter().filter(|w| **w > 0.0).count() > 100 && light != vec![1.0; 85 * 64]);
-        let alike = |(a, b): (&f32, &f32)| (a - b).abs() < 1e-2 + 1e-3 * b;
-        assert!(got.iter().zip(&want).all(alike) && light_far.iter().zip(&light).all(alike));
     }
 }
