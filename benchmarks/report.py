@@ -16,7 +16,7 @@ from benchmarks.process import machine
 from benchmarks.rows import Row, shown
 from benchmarks.study import Study
 from g2ard import __version__
-from g2ard.report.charts import COLORS, STYLE, Point, draw_chart, draw_legend, find_front, place_side_by_side
+from g2ard.report.charts import COLORS, STYLE, Point, draw_chart, draw_legend, find_front
 from g2ard.report.page import Page, Shown
 
 __all__ = ["write_report"]
@@ -73,12 +73,20 @@ def _study(page: Page, folder: Path, study: Study, rows: list[Row]) -> None:
         views = f": {group[0]['views']} {split} views" if "views" in group[0] else ""
         page.heading(f"{scene}{views}{f' against {against}' if against else ''}", 3)
         if "psnr" in group[0]:
-            page.html(place_side_by_side(_charts(group, names)))
+            page.html(_place_side_by_side(_charts(group, names)))
         for line in _over_seeds(group):
             page.paragraph(line)
         columns, cells = shown(row for row in group if row.get("final", 1))
         page.table(columns, cells, _best([row for row in group if row.get("final", 1)], columns))
         _views(page, folder, group)
+
+
+def _place_side_by_side(charts: Sequence[tuple[str, str]]) -> str:
+    """Return HTML of (caption, svg) charts side by side."""
+    figures = (
+        f"<figure>{svg}<figcaption>{escape(caption)}</figcaption></figure>" for caption, svg in charts if svg
+    )
+    return f'<div class="row">{"".join(figures)}</div>'
 
 
 def _name(row: Row) -> str:

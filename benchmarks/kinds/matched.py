@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,8 +29,7 @@ from benchmarks.score import figures, pictured, save_jpeg, score
 from benchmarks.study import Cell, SceneSpec, Study, key
 from benchmarks.workspace import Workspace, budget_of
 from g2ard import __version__, io
-from g2ard.config.choices import ADAPT_SCHEDULES, CONVENTIONS, ENGINES, LPIPS_INPUTS, SCHEDULE_NAMES
-from g2ard.config.choices import METHODS as SIMPLIFIERS
+from g2ard.config.choices import AdaptSchedule, Convention, Engine, LpipsInput, Method, ScheduleName
 from g2ard.errors import InputError
 from g2ard.io.splits import states_splits
 from g2ard.rendering.metrics import Lpips, load_lpips
@@ -74,17 +73,17 @@ class Matched(Study):
     steps: tuple[int, ...] = key((), least=1, axis=True)
     seconds: tuple[float, ...] = key((), least=1e-6, axis=True)
     released: bool = key(False, axis=True)
-    schedule: str = key("default", choices=SCHEDULE_NAMES)
+    schedule: str = key("default", choices=get_args(ScheduleName))
     sh_degree: int | None = key(None, least=0)
     adapt_steps: int = key(0, least=0)
-    adapt_schedule: str = key("default", choices=ADAPT_SCHEDULES)
+    adapt_schedule: str = key("default", choices=get_args(AdaptSchedule))
     adapt_on: str = key("train", choices=("train", "all"))
-    convention: str = key("gsplat", choices=CONVENTIONS)
+    convention: str = key("gsplat", choices=get_args(Convention))
     eight_bit: bool = key(False)
-    engine: str = key("fused", choices=ENGINES)
+    engine: str = key("fused", choices=get_args(Engine))
     fold: float = key(0.0, least=0)
     lpips: str | None = key(None)
-    lpips_input: str = key("scaled", choices=LPIPS_INPUTS)
+    lpips_input: str = key("scaled", choices=get_args(LpipsInput))
 
     def __post_init__(self) -> None:
         if not (self.steps or self.seconds or self.released):
@@ -470,7 +469,7 @@ class _Pipeline:
         state, flags = self.source, None
         for number, count in enumerate(counts):
             built = state = self._reduce(state, early, count, flags)
-            if method.reduce in (*SIMPLIFIERS, "no-views"):
+            if method.reduce in (*get_args(Method), "no-views"):
                 flags = state.output.with_name("flags.npy")
             for leg in (leg for leg in legs if leg.round == number):
                 state = self._recover(state, views if leg.final else early, leg, legs, built)

@@ -4,19 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, get_args
 
 from benchmarks import baselines
 from benchmarks.policies import POLICIES
 from benchmarks.study import key
-from g2ard.config.choices import METHODS as SIMPLIFIERS
-from g2ard.config.choices import SCHEDULE_NAMES
+from g2ard.config.choices import Method, ScheduleName
 from g2ard.errors import InputError
 from g2ard.stages.recover.anchors import REGULARIZERS
 
 __all__ = ["FINAL_STEPS", "METHODS", "REDUCERS", "ROUND_STEPS", "Budget", "Leg", "MethodSpec"]
 
-REDUCERS = (*SIMPLIFIERS, "no-views", "splat-transform", "splat-transform-adaptive", *baselines.METHODS)
+REDUCERS = (*get_args(Method), "no-views", "splat-transform", "splat-transform-adaptive", *baselines.METHODS)
 """Reductions: g2ard's methods, splat-transform, baselines."""
 
 ROUND_STEPS, FINAL_STEPS = 8_000, 30_000
@@ -81,7 +80,7 @@ class MethodSpec:
     lambdas: str = key("own", choices=("own", "paper"))
     regularizers: Mapping[str, Any] = key({})
     protection: float | None = key(None, least=0)
-    schedule: str | None = key(None, choices=SCHEDULE_NAMES)
+    schedule: str | None = key(None, choices=get_args(ScheduleName))
     released_steps: int | None = key(None, least=0)
     released_schedule: str = key("3dgs", choices=("3dgs", "paper", "default"))
 

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, get_args
 
 import numpy as np
 
@@ -16,7 +16,7 @@ from benchmarks.rows import Row
 from benchmarks.score import figures, score
 from benchmarks.study import Cell, SceneSpec, Study, key
 from benchmarks.workspace import PROTOCOLS, Workspace, budget_of, kinds_for
-from g2ard.config.choices import ENGINES
+from g2ard.config.choices import Engine
 from g2ard.errors import InputError
 from g2ard.pipeline.config import DistillConfig
 from g2ard.pipeline.distill import distill
@@ -74,7 +74,7 @@ class Recover(Study):
     DEFAULT: ClassVar[Variant] = Variant("default")
 
     steps: tuple[int, ...] = key((1000,), least=1, axis=True)
-    engine: str = key("fused", choices=ENGINES)
+    engine: str = key("fused", choices=get_args(Engine))
     gsplat: bool = key(False)
     protocol: str = key("all", choices=tuple(PROTOCOLS), axis=True)
 

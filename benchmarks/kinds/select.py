@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any, ClassVar, cast
+from typing import Any, ClassVar, cast, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,7 @@ from benchmarks.policies import order_views
 from benchmarks.rows import Row
 from benchmarks.study import Cell, SceneSpec, Study, key
 from benchmarks.workspace import Workspace
-from g2ard.config.choices import ENGINES, Engine
+from g2ard.config.choices import Engine
 from g2ard.io.splits import splits_of, states_splits
 from g2ard.poses import make_pool, plan_pool
 from g2ard.rendering.targets import Subset, Targets, TeacherRenders
@@ -69,7 +69,7 @@ class Select(Study):
     percents: tuple[float, ...] = key((10.0, 25.0, 50.0), least=1e-3, axis=True)
     draws: int = key(3, least=1, axis=True)
     steps: tuple[int, ...] = key((250,), least=1, axis=True)
-    engine: str = key("fused", choices=ENGINES)
+    engine: str = key("fused", choices=get_args(Engine))
     count: int = key(10_000, least=1)
     candidates: int = key(160, least=8)
     tests: int = key(24, least=1)

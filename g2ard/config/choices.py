@@ -19,7 +19,6 @@ UNITS: dict[LengthUnit, float] = {"m": 1.0, "ft": 0.3048, "us-ft": 1200 / 3937}
 
 Method = Literal["default", "fast", "paper"]
 """Methods of simplification."""
-METHODS: tuple[Method, ...] = get_args(Method)
 
 Policy = Literal["auto", "directional"]
 """Policies of view selection."""
@@ -34,7 +33,6 @@ Focus = Literal["far", "near", "standing", "anywhere"]
 
 ScheduleName = Literal["fast", "default", "best", "paper"]
 """Schedules of recovery (`g2ard.stages.recover.config`)."""
-SCHEDULE_NAMES: tuple[ScheduleName, ...] = get_args(ScheduleName)
 
 PaperPresetName = Literal["paper", "paper-trained", "paper-lift", "paper-noisy"]
 """The paper's regularisers, for a prior that is measured or named."""
@@ -43,11 +41,9 @@ PresetName = Literal["auto", "trained", "lift", "noisy", PaperPresetName]
 
 Engine = Literal["fused", "torch"]
 """Engines that run recovery's steps (`g2ard.stages.recover.engine`)."""
-ENGINES: tuple[Engine, ...] = get_args(Engine)
 
 AdaptSchedule = Literal["default", "paper"]
 """Schedules of adaptation (`g2ard.pipeline.adapt`)."""
-ADAPT_SCHEDULES: tuple[AdaptSchedule, ...] = get_args(AdaptSchedule)
 
 Refinement = Literal["auto", "none", "photometric"]
 """Refinements of a photo's pose after feature matching (`g2ard.stages.register`)."""
@@ -63,7 +59,6 @@ PointColor = Literal["intensity", "class"]
 
 Convention = Literal["gsplat", "inria"]
 """Rasteriser conventions that renderers disagree on (`g2ard.rendering.renderer`)."""
-CONVENTIONS: tuple[Convention, ...] = get_args(Convention)
 
 RenderModel = Literal["classic", "antialiased"]
 """Renderings that scenes are trained for; antialiased is also called mip (`g2ard.rendering.renderer`)."""
@@ -83,7 +78,6 @@ NAMED_AXES: dict[str, Axes] = {"y-up": "RUB", "z-up": "RFU"}
 
 LpipsInput = Literal["scaled", "unscaled"]
 """Value range of the images passed to LPIPS's networks (`g2ard.rendering.metrics`)."""
-LPIPS_INPUTS: tuple[LpipsInput, ...] = get_args(LpipsInput)
 
 ViewFormat = Literal["g2ard", "inria", "nerfstudio", "colmap"]
 """Formats that views can be written to (`g2ard.io.views`)."""

@@ -157,7 +157,6 @@ class TilePlan:
         tiles: number of tiles; expected, if they are not written yet.
         bytes: peak memory of all processes together.
         memory: bytes that they may take.
-        written: whether the tiles are written.
         disk: bytes of the tiles and of the files of their tasks.
     """
 
@@ -166,7 +165,6 @@ class TilePlan:
     workers: int
     bytes: int
     memory: int
-    written: bool
     disk: int
 
 
@@ -214,6 +212,5 @@ def plan_tiles(scene: TileStore | SceneStream | PointStream, tiling: Tiling, tim
         workers,
         workers * need + (_TASK_BYTES if workers > 1 else 0),
         memory,
-        isinstance(scene, TileStore),
         (_DISK_COPIES + isinstance(scene, PointStream)) * count * row_bytes,
     )

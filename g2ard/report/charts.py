@@ -233,14 +233,6 @@ def _draw_names(points: Sequence[Point], x: _Axis, y: _Axis) -> list[str]:
     return out
 
 
-def place_side_by_side(charts: Sequence[tuple[str, str]]) -> str:
-    """Return HTML of (caption, svg) charts side by side."""
-    figures = (
-        f"<figure>{svg}<figcaption>{escape(caption)}</figcaption></figure>" for caption, svg in charts if svg
-    )
-    return f'<div class="row">{"".join(figures)}</div>'
-
-
 def draw_legend(series: Sequence[str], marks: Sequence[str] = ()) -> str:
     """Return the legend of colours (methods), and of marks with their names."""
     items = [

@@ -294,7 +294,7 @@ def check_finite(splats: Splats, parameter: str) -> None:
         raise InputError(text, parameter=parameter, index=int(bad[0]))
 
 
-def unit_colors(colors: ArrayLike, parameter: str = "colors") -> NDArray[np.float64]:
+def unit_colors(colors: ArrayLike) -> NDArray[np.float64]:
     """Return colours in [0, 1]: bytes divided by 255, 16-bit integers by 65,535, others as they are.
 
     >>> unit_colors(np.uint8([[255, 51, 0]])).tolist()
@@ -311,7 +311,7 @@ def unit_colors(colors: ArrayLike, parameter: str = "colors") -> NDArray[np.floa
         row = np.argwhere(wrong)[0]
         raise InputError(
             f"has {values[tuple(row)]:g}, expected 0 to 1",
-            parameter=parameter,
+            parameter="colors",
             index=int(row[0]),
             hint="divide by the largest value, or pass uint8",
         )

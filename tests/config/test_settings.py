@@ -154,9 +154,9 @@ def test_settings_in_a_config_file_and_over_it(folder: Path, command_line: Comma
 
 
 def test_every_list_of_names_matches_its_table() -> None:
-    assert tuple(SCHEDULES) == choices.SCHEDULE_NAMES
+    assert tuple(SCHEDULES) == get_args(choices.ScheduleName)
     assert set(FORMATS) == set(get_args(choices.FormatName))
     presets = {"auto", *REGULARIZERS, "paper", *(f"paper-{name}" for name in PAPER_REGULARIZERS)}
     assert set(get_args(choices.PresetName)) == presets
-    for method in choices.METHODS:
+    for method in get_args(choices.Method):
         assert SimplifyConfig(method).rounds(9, 3)

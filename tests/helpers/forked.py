@@ -3,27 +3,28 @@
 import hashlib
 from collections.abc import Iterator
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
 import g2ard._core as _core
-from g2ard.config.choices import METHODS
+from g2ard.config.choices import Method
 from g2ard.rendering.renderer import RasterSettings, Renderer, arrays_of, view_of
 from g2ard.rendering.visibility import visibility, visibility_source
 from g2ard.scene.prepared import finite_rows_of
 from g2ard.stages.lift import lift
 from g2ard.stages.recover.config import Rates
 from g2ard.stages.select import select
-from g2ard.stages.simplify import SimplifyConfig, flag, simplify
+from g2ard.stages.simplify import SimplifyConfig, simplify
 from helpers.scenes import around, checkered_ball
+from helpers.simplify_cases import flag
 
 
 def _results() -> Iterator[NDArray[Any]]:
     ball, views = checkered_ball(600), around(6, (48, 40))
     yield flag(ball, 60)
-    for method in METHODS:
+    for method in get_args(Method):
         yield simplify(ball, 60, method=method).splats.means
     yield simplify(ball, 60, visibility=visibility_source(views)).splats.means
     scene, _ = finite_rows_of(ball)

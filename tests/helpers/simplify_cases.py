@@ -1,8 +1,12 @@
 """Scenes, views and checks that the tests of simplification share."""
 
 import numpy as np
+from numpy.typing import NDArray
 
+import g2ard._core as _core
+from g2ard.scene.prepared import finite_rows_of
 from g2ard.scene.splats import ARRAYS, Splats, unit_quats
+from g2ard.stages.simplify import SimplifyConfig
 
 
 def scene(n=2000, rest=3, seed=0, dtype=np.float32):
@@ -69,3 +73,12 @@ def assert_kept(prior, row, out, at):
         before = getattr(prior, name)[row]
         before = before if name != "quats" else unit_quats(before[None])[0]
         np.testing.assert_array_equal(getattr(out, name)[at], before, err_msg=name)
+
+
+def flag(splats: Splats, budget: int, config: SimplifyConfig | None = None) -> NDArray[np.bool_]:
+    """Return which Gaussians `paper` protects for a final budget: p_i = 1[E_c(i) > ε_h] (eq. `frequency`)."""
+    scene, finite = finite_rows_of(splats)
+    paper = (config or SimplifyConfig()).turned("paper").resolved()
+    flags = np.zeros(len(splats), bool)
+    flags[finite] = _core.simplify_flags(scene.core, budget, paper)
+    return flags

@@ -1,17 +1,20 @@
 """Simplification: properties of every method, and the command."""
 
 from dataclasses import replace
+from typing import get_args
 
 import numpy as np
 import pytest
 
-from g2ard.config.choices import METHODS
+from g2ard.config.choices import Method
 from g2ard.errors import InputError
 from g2ard.scene.splats import Splats
 from g2ard.stages.simplify import SimplifyConfig, round_counts, simplify
 from helpers.scenes import assert_same_bits
 from helpers.simplify_cases import Views, all_alike, assert_sound, scene
 from helpers.threads import on_threads
+
+METHODS = get_args(Method)
 
 
 @pytest.mark.parametrize("method", METHODS)

@@ -5,8 +5,8 @@ import pytest
 
 from g2ard.scene.splats import ARRAYS, Splats
 from g2ard.scene.transform import join
-from g2ard.stages.simplify import SimplifyConfig, flag, round_counts, simplify
-from helpers.simplify_cases import assert_kept, assert_sound, scene
+from g2ard.stages.simplify import SimplifyConfig, round_counts, simplify
+from helpers.simplify_cases import assert_kept, assert_sound, flag, scene
 from reference import simplify as naive
 
 

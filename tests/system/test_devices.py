@@ -25,13 +25,14 @@ from g2ard.scene.splats import Splats
 from g2ard.stages.recover.config import RecoverConfig
 from g2ard.stages.recover.optimize import recover
 from g2ard.stages.select import surface, visible_cells
-from g2ard.stages.simplify import Simplified, flag, simplify
+from g2ard.stages.simplify import Simplified, simplify
 from g2ard.system import devices
 from helpers.commands import CommandLine, refused, succeeds
 from helpers.gpus import skip_without_gpu
 from helpers.project import ROOT
 from helpers.realdata import real
 from helpers.scenes import around, assert_same_bits, checkered_ball
+from helpers.simplify_cases import flag
 
 SEEN_ALIKE = 0.999
 """Share of (view, cell) that must agree."""

@@ -2,7 +2,7 @@
 
 from g2ard.stages.simplify.config import Default, Fast, Pairs, Paper, SimplifyConfig, round_counts
 from g2ard.stages.simplify.pairs import VisibilitySource
-from g2ard.stages.simplify.reduce import Simplified, flag, simplify
+from g2ard.stages.simplify.reduce import Simplified, simplify
 
 __all__ = [
     "Default",
@@ -12,7 +12,6 @@ __all__ = [
     "Simplified",
     "SimplifyConfig",
     "VisibilitySource",
-    "flag",
     "round_counts",
     "simplify",
 ]

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g2ard.progress import Say
-from g2ard.rendering.renderer import RasterSettings, Renderer, settings_for
+from g2ard.rendering.renderer import Renderer, settings_for
 from g2ard.scene.cameras import Camera, Cameras
 from g2ard.scene.samples import evenly_spaced
 from g2ard.scene.splats import Splats
@@ -35,17 +35,14 @@ def some_views(cameras: Cameras) -> Cameras:
     return cameras.take(evenly_spaced(len(cameras), _VIEWS)).resized(_PIXELS)
 
 
-def light_lost(
-    dense: Splats, result: Splats, views: Iterable[Camera], settings: RasterSettings | None = None
-) -> tuple[float, float]:
+def light_lost(dense: Splats, result: Splats, views: Iterable[Camera]) -> tuple[float, float]:
     """Sum the light that a result lets through in pixels where the dense scene is opaque.
 
     Returns:
         The light that they let through though the dense scene stops it, and all that the dense scene stops
         there.
     """
-    if settings is None:
-        settings = settings_for(dense.means, antialiased=dense.antialiased)
+    settings = settings_for(dense.means, antialiased=dense.antialiased)
     before, after = (Renderer(scene, settings=settings) for scene in (dense, result))
 
     def lost(view: Camera) -> tuple[float, float]:

@@ -116,34 +116,6 @@ class Simplified(Shown):
         return f"Simplified({len(self.parents):,} → {plural(len(self.splats), 'Gaussian')})"
 
 
-def flag(
-    splats: Splats, budget: int, *, config: SimplifyConfig = _DEFAULTS, progress: Progress = silent
-) -> NDArray[np.bool_]:
-    """Compute protection flags of a raw prior: p_i = 1[E_c(i) > ε_h] (eq. `frequency`).
-
-    E_j is the mean squared residual of an affine predictor of colour, clamped to [0, 1], within cell j, over
-    about `budget` cells; a cell with few members borrows those of its face neighbours for the fit.
-
-    Args:
-        splats: the raw prior; in a recovered scene fitting hides the residual.
-        budget: the final count N_S, which sets the cell size.
-        config: uses `flag_threshold` and `flag_members`.
-
-    Returns:
-        (N,) bool; False for rows that are not finite.
-
-    Raises:
-        InputError: no finite row, or a budget below 1.
-    """
-    require("budget", budget, budget >= 1, "at least 1")
-    scene, finite = finite_rows_of(splats)
-    paper = config.turned("paper").resolved()
-    flagged = _core.simplify_flags(scene.core, budget, paper, counter(progress, "flag"))
-    flags = np.zeros(len(splats), bool)
-    flags[finite] = flagged
-    return flags
-
-
 def simplify(
     splats: Splats,
     budget: int,
@@ -183,8 +155,8 @@ def simplify(
         method: turns the config into this method's.
         visibility: for `default` and `fast`: visibility of each Gaussian (`g2ard.rendering.visibility`), or a
             function scene → visibility, also called on the result to fit its opacities.
-        protected: (N,) bool flags to inherit. If None, `paper` computes them (see `flag`); the other methods
-            do not use them.
+        protected: (N,) bool flags to inherit. If None, `paper` computes them; the other methods do not use
+            them.
         final_budget: for `paper`: N_S, if this call is one round on the way to a smaller count; it sets the
             size of cells. None means `budget`.
         gaps: measure the opacity lost in the views of `visibility`, if it has the attribute `views`.
