@@ -30,6 +30,7 @@ from g2ard.jobs.memory import RECOVERY_TIMES, TilePlan
 from g2ard.jobs.run_views import Use, is_untouched, pool_times, views_of, within_pixels
 from g2ard.jobs.simplify import Reduction
 from g2ard.jobs.start_points import (
+    colored_source,
     is_sparse_file,
     placed_source,
     rough_points,
@@ -605,6 +606,7 @@ def preparing(
         parts = split_views(views, options.held_out, say)
         if not scene.others and is_sparse_file(scene, views):
             source = placed_source(scene, parts[0].cameras)
+        source = colored_source(source, parts[0].cameras, planned=planned)
     with opened(
         source, tiling, RECOVERY_TIMES, config.simplify, config.lift, planned=planned, **callbacks
     ) as tiles:

@@ -20,6 +20,7 @@ from g2ard.jobs.inputs import Views
 from g2ard.progress import Progress, Say, plural, unsaid
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.samples import evenly_spaced
+from g2ard.stages.photo_points.colors import ColoredStream
 from g2ard.stages.photo_points.rays import points_along_rays
 
 _PIXELS_PER_GAUSSIAN = 100
@@ -116,6 +117,19 @@ def placed_source(scene: Source, train: Cameras) -> Source:
 
     placed.through = through
     return placed
+
+
+def colored_source(scene: Source, train: Cameras, *, planned: bool) -> Source:
+    """Return a point cloud without colours with those of training photos, block by block."""
+    found, chosen = Source(scene.path, None, [other.path for other in scene.others]), scene.through
+
+    def through(stream: PointStream) -> PointStream:
+        stream = chosen(stream) if chosen else stream
+        bare = stream.channels != 3 and any(train.image_paths)
+        return stream if not bare else ColoredStream(stream, train, planned=planned)
+
+    found.through = through
+    return found
 
 
 def is_sparse_file(scene: Source, views: Views) -> bool:

@@ -19,8 +19,9 @@ from g2ard.scene.splats import Splats
 from g2ard.scene.transform import join
 from g2ard.stages.simplify.gaps import opacity_lost
 from g2ard.tiles.ingest import ingest
-from helpers.commands import CommandLine, succeeds
+from helpers.commands import CommandLine, refused, succeeds
 from helpers.photos import photographed
+from helpers.ply_files import save
 from helpers.scenes import checkered_ball, under_a_sky
 from helpers.skies import courtyard
 from helpers.tiled_scenes import ring, town
@@ -69,6 +70,7 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     dense = g2ard.load(folder / "landscape.ply")
     colors = np.clip(0.5 + 0.28 * dense.sh0[:, 0], 0, 1)
     write_points(folder / "cloud.ply", Points(dense.means.astype(float), colors))
+    save(folder / "bare.ply", dict(zip("xyz", dense.means.T.astype(float), strict=True)), dtype="f8")
     views, splits = ring(16), ["train"] * 12 + ["test"] * 4
     g2ard.save_views(folder / "views.json", views, splits=splits)
     g2ard.save_views(folder / "photos.json", photographed(folder, dense, views), splits=splits)
@@ -178,6 +180,7 @@ INPUTS = {
     "photos": ("landscape.ply", "--views", "photos.json"),
     "cloud": ("cloud.ply",),
     "cloud and photos": ("cloud.ply", "--views", "photos.json"),
+    "cloud without colours": ("bare.ply", "--views", "photos.json"),
 }
 
 
@@ -206,3 +209,12 @@ def test_runs_have_the_same_parts(name: str, inputs: Path, command_line: Command
         scores = [g2ard.evaluate(g2ard.load(folder / way / file), targets).psnr for way in WAYS]
         least.append(scores[0])  # so few steps gain, or the guard takes them back
         assert scores[1] > min(least) - _LOST_BY_FEW, scores
+
+
+def test_points_without_colours_need_photos(inputs: Path, command_line: CommandLine, tmp_path: Path) -> None:
+    for command, output in (("simplify", "out.ply"), ("distill", "out")):
+        call = (command, inputs / "bare.ply", "-n", 200, *WAYS["tiles"], "-o", output)
+        told = refused(command_line, tmp_path, *call, status=1)
+        assert "add colours" in told
+        assert told.count("\n") == 1
+        assert not list(tmp_path.iterdir())

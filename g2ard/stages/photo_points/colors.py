@@ -2,13 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Self
+
 import numpy as np
 from numpy.typing import NDArray
 
+from g2ard.io.paths import file_identity
 from g2ard.io.photos import load_photo
-from g2ard.io.types import Cloud, Points
+from g2ard.io.sanitize import Tally
+from g2ard.io.stream import MarkedPoints, PointStream, RawPoints
+from g2ard.io.types import Cloud, Note, Notes, Points
 from g2ard.progress import Progress, Say, plural, silent
 from g2ard.scene.cameras import Cameras
+from g2ard.system.cached import cached_property
+from g2ard.system.keys import key_of
 
 _PHOTO_SIDE = 640
 """Longer side in pixels of the photos that colour points."""
@@ -18,6 +28,9 @@ _CELL_POINTS = 4
 """Points per cell of the grid in which the nearest hide others."""
 _DEPTH_SLACK = 0.05
 """Relative depth behind the nearest point of a cell within which points are seen."""
+_HIDING = 200_000
+"""Points of a cloud in blocks, to twice as many, that hide others."""
+_UNCOLORED_NOTES = ("grey", "black", "black_points")
 
 
 def colored(cloud: Cloud, train: Cameras, name: str, *, progress: Progress = silent, say: Say) -> Points:
@@ -28,18 +41,109 @@ def colored(cloud: Cloud, train: Cameras, name: str, *, progress: Progress = sil
     cameras = train.fitted(_PHOTO_SIDE)
     rows = [row for row, path in enumerate(cameras.image_paths) if path is not None]
     found, seen = median_colors(points.positions, bare, cameras.take(rows), progress)
-    colors = points.colors.copy()
-    colors[np.flatnonzero(bare)[seen]] = found[seen]
-    if seen.any() and not points.colors[bare].any():  # what no photo sees takes the usual colour
-        colors[np.flatnonzero(bare)[~seen]] = np.median(found[seen], axis=0)
+    colors = _with_photo_colors(points.colors, bare, found, seen)
     if seen.any():
         shown = f"{int(seen.sum()):,} of {plural(len(seen), 'point')} without colours"
         say(f"{name}: {shown} take them from the photos that see them")
     return Points(points.positions, colors)
 
 
+class ColoredStream(PointStream):
+    """A point cloud without colours in blocks, whose points take those of photos, as by `colored`.
+
+    Its points that hide others are a sample.
+
+    Args:
+        planned: leave points as they are, in a dry run.
+    """
+
+    def __init__(self, stream: PointStream, cameras: Cameras, *, planned: bool = False) -> None:
+        vars(self).update(vars(stream))  # the same cloud
+        pictured = [row for row, path in enumerate(cameras.image_paths) if path is not None]
+        self._bare = stream
+        self._photos = cameras.take(pictured).fitted(_PHOTO_SIDE)
+        self._planned = planned
+        self.channels = 3
+
+    @cached_property
+    def hiding(self) -> NDArray[np.float64]:
+        """Points that hide others."""
+        stride, read, parts = max(1, self.count // _HIDING), 0, []
+        for near in self.positions(1 << 20):
+            parts.append(near[-read % stride :: stride])
+            read += len(near)
+        points = np.concatenate(parts)
+        return points[np.isfinite(points).all(axis=1)] + self.offset
+
+    def __getstate__(self) -> dict[str, Any]:
+        _ = self.hiding  # found once, not by each process
+        return super().__getstate__()
+
+    def identity(self) -> list[Any]:
+        photos = [path for path in (*self._photos.image_paths, *self._photos.mask_paths) if path is not None]
+        return [self._bare.identity(), key_of(self._photos), file_identity(photos)]
+
+    def absolute(self) -> Self:
+        found = super().absolute()
+        found._bare = self._bare.absolute()
+        found._photos = replace(
+            self._photos,
+            image_paths=_make_absolute(self._photos.image_paths),
+            mask_paths=_make_absolute(self._photos.mask_paths),
+        )
+        return found
+
+    def parts(self, rows: int) -> list[tuple[int, int]]:
+        return self._bare.parts(rows)
+
+    def tallies(self) -> list[Tally]:
+        return self._bare.tallies()
+
+    def all_notes(self) -> Notes:
+        notes = self._bare.all_notes()
+        bare = sum(note.count for note in notes if note.code in _UNCOLORED_NOTES)
+        text = f"{plural(bare, 'point')} without colours take them from the photos that see them"
+        kept = tuple(note for note in notes if note.code not in _UNCOLORED_NOTES)
+        return (*kept, Note("photo_colors", bare, text)) if bare else kept
+
+    def raw(self, rows: int, start: int) -> Iterator[MarkedPoints]:
+        return self._bare.raw(rows, start)
+
+    def blocks(self, rows: int, start: int = 0) -> Iterator[RawPoints]:
+        for positions, colors in self._bare.blocks(rows, start):
+            if not self._planned:
+                bare = np.ones(len(positions), bool)
+                found, seen = median_colors(positions, bare, self._photos, hiding=self.hiding)
+                colors = _with_photo_colors(colors, bare, found, seen)
+            yield positions, colors
+
+
+def _make_absolute(paths: Sequence[Path | None]) -> tuple[Path | None, ...]:
+    return tuple(None if path is None else path.absolute() for path in paths)
+
+
+def _with_photo_colors(
+    colors: NDArray[np.float32],
+    bare: NDArray[np.bool_],
+    found: NDArray[np.float32],
+    seen: NDArray[np.bool_],
+) -> NDArray[np.float32]:
+    """Return colours with those that photos show; black that none shows becomes the usual colour."""
+    black = not colors[bare].any()
+    colors = colors.copy()
+    colors[np.flatnonzero(bare)[seen]] = found[seen]
+    if seen.any() and black:
+        colors[np.flatnonzero(bare)[~seen]] = np.median(found[seen], axis=0)
+    return colors
+
+
 def median_colors(
-    positions: NDArray[np.float64], wanted: NDArray[np.bool_], cameras: Cameras, progress: Progress = silent
+    positions: NDArray[np.float64],
+    wanted: NDArray[np.bool_],
+    cameras: Cameras,
+    progress: Progress = silent,
+    *,
+    hiding: NDArray[np.float64] | None = None,
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     """Return the (n, 3) median colours of the wanted points in photos that see them, and whether any does.
 
@@ -48,20 +152,26 @@ def median_colors(
     Args:
         positions: (N, 3) world coordinates.
         wanted: (N,), n of which are true.
+        hiding: (M, 3) points that hide others, None for all positions.
     """
     own = np.flatnonzero(wanted)
     kept = np.zeros((len(own), _SEEN, 3), np.uint8)
     count = np.zeros(len(own), np.intp)
     for done, view in enumerate(np.random.default_rng(0).permutation(len(cameras)).tolist()):
         progress("colour points", done, len(cameras))
-        pixels, visible = _seen(positions, cameras, view)
-        rows = np.flatnonzero(visible[own] & (count < _SEEN))
+        few = np.flatnonzero(count < _SEEN)
+        if hiding is None:
+            pixels, visible = (found[own[few]] for found in _seen(positions, positions, cameras, view))
+        else:
+            pixels, visible = _seen(positions[own[few]], hiding, cameras, view)
+        pixels = pixels[visible]
+        rows = few[visible]
         if not len(rows):
             continue
         image, mask = load_photo(cameras, view, None)
-        sample = image[pixels[own[rows], 1], pixels[own[rows], 0]]
+        sample = image[pixels[:, 1], pixels[:, 0]]
         if mask is not None:
-            held = mask[pixels[own[rows], 1], pixels[own[rows], 0]]
+            held = mask[pixels[:, 1], pixels[:, 0]]
             rows, sample = rows[held], sample[held]
         if image.shape[2] == 4:
             rows, sample = rows[sample[:, 3] > 0.5], sample[sample[:, 3] > 0.5]
@@ -76,9 +186,27 @@ def median_colors(
 
 
 def _seen(
-    positions: NDArray[np.float64], cameras: Cameras, view: int
+    positions: NDArray[np.float64], hiding: NDArray[np.float64], cameras: Cameras, view: int
 ) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
     """Return (N, 2) columns and rows of points in a view, and whether they are inside and not hidden."""
+    pixels, depth, inside = own = _project(positions, cameras, view)
+    others, depths, drawn = own if hiding is positions else _project(hiding, cameras, view)
+    width, height = int(cameras.widths[view]), int(cameras.heights[view])
+    side = max(1.0, np.sqrt(width * height * _CELL_POINTS / max(1, int(drawn.sum()))))
+    across = int(width / side) + 1
+
+    def cells(at: NDArray[np.intp]) -> NDArray[np.intp]:
+        return (at[:, 1] / side).astype(np.intp) * across + (at[:, 0] / side).astype(np.intp)
+
+    nearest = np.full(across * (int(height / side) + 1), np.inf)
+    np.minimum.at(nearest, cells(others[drawn]), depths[drawn])
+    return pixels, inside & (depth <= (1 + _DEPTH_SLACK) * nearest[cells(pixels)])
+
+
+def _project(
+    positions: NDArray[np.float64], cameras: Cameras, view: int
+) -> tuple[NDArray[np.intp], NDArray[np.float64], NDArray[np.bool_]]:
+    """Return (N, 2) columns and rows of points in a view, their depths, and whether they are inside."""
     width, height = int(cameras.widths[view]), int(cameras.heights[view])
     pose, K = cameras.viewmats[view].astype(np.float64), cameras.Ks[view]
     local = positions @ pose[:3, :3].T + pose[:3, 3]
@@ -86,10 +214,4 @@ def _seen(
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         u, v = local[:, 0] / depth * K[0, 0] + K[0, 2], local[:, 1] / depth * K[1, 1] + K[1, 2]
     inside = (depth > 0) & (u >= 0) & (v >= 0) & (u < width) & (v < height)
-    pixels = np.where(inside[:, None], np.stack([u, v], axis=1), 0).astype(np.intp)
-    side = max(1.0, np.sqrt(width * height * _CELL_POINTS / max(1, int(inside.sum()))))
-    across = int(width / side) + 1
-    cells = (pixels[:, 1] / side).astype(np.intp) * across + (pixels[:, 0] / side).astype(np.intp)
-    nearest = np.full(across * (int(height / side) + 1), np.inf)
-    np.minimum.at(nearest, cells[inside], depth[inside])
-    return pixels, inside & (depth <= (1 + _DEPTH_SLACK) * nearest[cells])
+    return np.where(inside[:, None], np.stack([u, v], axis=1), 0).astype(np.intp), depth, inside
