@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -148,8 +149,7 @@ def weight_of_others(usual: int, others: int) -> float:
 
 
 class _Sampler:
-    """Function of `visibility_source`: `rounds` of usual `views`, of which the first `used` are rendered, and
-    `others`."""
+    """Function of `visibility_source`: usual `views`, of which it renders the rounds `used`, and `others`."""
 
     def __init__(self, cameras: Cameras, longest: int, progress: Progress) -> None:
         usual, others = usual_and_others(cameras)
@@ -157,9 +157,7 @@ class _Sampler:
         full = usual.take(evenly_spaced(len(usual), MOST_VIEWS))
         self.views = full.resized(longest)
         self.shrunk = np.float32((self.views.widths / full.widths).mean())
-        apart = max(1, math.ceil(len(self.views) / ROUND))
-        self.rounds = [range(first, len(self.views), apart) for first in spread(apart)]
-        self.used = 0  # until the first scene decides it
+        self.used: list[range] | None = None  # until the first scene decides it
         self.settings = RasterSettings()
         self.progress = progress
 
@@ -167,37 +165,49 @@ class _Sampler:
         core = as_prepared(scene).core
         sums = _core.VisibilityAccumulator(core)
         here = self.views.recentred(scene.offset)
-        if self.used:
-            for views in self.rounds[: self.used]:
-                self._add(sums, here, views)
-        else:
+        if self.used is None:
             distance = np.median(np.linalg.norm(here.positions - core.origin, axis=1))
             self.settings = RasterSettings(antialiased=scene.antialiased, near=NEAR * float(distance) or None)
-            self.used = self._add_until_converged(sums, here, len(scene))
+            self.used = add_until_converged(
+                lambda views: self._add(sums, here, views),
+                len(here),
+                len(scene),
+                free=_FREE_GAUSSIAN_VIEWS,
+            )
+        else:
+            for views in self.used:
+                self._add(sums, here, views)
         weight, pixel_size = sums.by_row()
         if len(self.others):
-            rendered = sum(map(len, self.rounds[: self.used]))
+            rendered = sum(map(len, self.used))
             sums = _core.VisibilityAccumulator(core)
             self._add(sums, self.others.recentred(scene.offset), range(len(self.others)))
             weight += np.float32(weight_of_others(rendered, len(self.others))) * sums.by_row()[0]
         return SampledVisibility(weight, pixel_size * self.shrunk)
 
-    def _add_until_converged(self, sums: _core.VisibilityAccumulator, cameras: Cameras, rows: int) -> int:
-        """Add rounds while they are cheap or find new Gaussians; return their number."""
-        number = seen = 0
-        for number, views in enumerate(self.rounds, 1):
-            before = seen
-            seen = self._add(sums, cameras, views)
-            converged = number > 1 and seen - before < CONVERGED * rows
-            cheap = number * ROUND * rows < _FREE_GAUSSIAN_VIEWS
-            if converged and not cheap:
-                break
-        return number
-
     def _add(self, sums: _core.VisibilityAccumulator, cameras: Cameras, views: range) -> int:
         """Add a round of views; return the number of Gaussians seen so far."""
         made = [view_of(cameras, i, self.settings) for i in views]
         return sums.add(made, self.settings, counter(self.progress, "visibility"))
+
+
+def add_until_converged(add: Callable[[range], int], count: int, rows: int, *, free: int = 0) -> list[range]:
+    """Add rounds of views until one finds few new Gaussians; return those that were added.
+
+    Args:
+        add: adds some of `count` views, and returns how many of `rows` Gaussians were seen so far.
+        free: Gaussians × views up to which rounds are added without need.
+    """
+    apart = max(1, math.ceil(count / ROUND))
+    rounds = list[range]()
+    seen = 0
+    for first in spread(apart):
+        rounds.append(range(first, count, apart))
+        before, seen = seen, add(rounds[-1])
+        converged = len(rounds) > 1 and seen - before < CONVERGED * rows
+        if converged and len(rounds) * ROUND * rows >= free:
+            break
+    return rounds
 
 
 def spread(count: int) -> list[int]:

@@ -12,10 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g2ard.config.choices import BLACK, Colour
-from g2ard.io.sanitize import BLOCK
-from g2ard.io.stream import PartsStream, SceneStream
+from g2ard.io.stream import PartsStream
 from g2ard.io.tile_store import TileStore
-from g2ard.pipeline.dense import InMemory
+from g2ard.pipeline.dense import InMemory, whole
 from g2ard.progress import Progress, silent
 from g2ard.rendering.boxes import front_to_back
 from g2ard.rendering.recolour import seen_by, shifted
@@ -29,12 +28,11 @@ from g2ard.stages.clean import Cleaning, extent_of
 from g2ard.stages.simplify import Default, SimplifyConfig
 from g2ard.stages.simplify.gaps import let_through, some_views
 from g2ard.stages.simplify.pairs import MANY
-from g2ard.stages.simplify.reduce import SimplifyReport
 from g2ard.system.cached import cached_property
 from g2ard.system.keys import key_of
 from g2ard.tiles.executor import Workers
 from g2ard.tiles.ingest import ingest
-from g2ard.tiles.merging import scene_in_tiles, simplify_tiles
+from g2ard.tiles.merging import Merged, scene_in_tiles, simplify_tiles
 from g2ard.tiles.sights import boxes_of, levels_of, written
 from g2ard.tiles.simplify import TiledRun
 from g2ard.tiles.tasks import Task, load
@@ -44,47 +42,6 @@ _VIEWS_PER_TASK = 32
 
 _KEPT_BYTES = 500_000_000
 """Bytes of images kept in memory; further ones are read from their file again on each access."""
-
-
-@dataclass(frozen=True, eq=False)
-class MergedTiles:
-    """A scene merged in tiles, and a report.
-
-    Args:
-        files: that have the `parents` of each tile's rows; none if nothing was merged.
-    """
-
-    splats: Splats | PartsStream
-    report: SimplifyReport
-    store: TileStore
-    files: Sequence[Path]
-
-    @property
-    def protected(self) -> NDArray[np.bool_] | None:
-        """(M,) protection flags, if the method has them."""
-        flags = [load(path, "protected")[0] for path in self.files if path.name.startswith("reduce")]
-        return np.concatenate(flags) if flags else None
-
-    def parents(self, scene: SceneStream) -> NDArray[np.int64]:
-        """Return (N,) the row in the result of each Gaussian, see `Simplified`.
-
-        Args:
-            scene: what was cut into the tiles, or they themselves: it gives the order of the rows.
-        """
-        rows = [tile.rows for tile in self.store.tiles]
-        counts = self.report.tiles or rows
-        parents = [load(path, "parents")[0] for path in self.files] or [np.arange(n) for n in rows]
-        before = np.cumsum([0, *counts])[:-1]
-        moved = [np.where(own < 0, -1, own + np.int64(n)) for own, n in zip(parents, before, strict=True)]
-        if scene.identity() == [self.store.key]:
-            return np.concatenate(moved)
-        out, done, begin = np.empty(self.store.count, np.int64), [0] * len(rows), 0
-        for block in scene.blocks(BLOCK):
-            for tile, (core, _) in enumerate(self.store.tree.route(block.means)):
-                out[begin + core] = moved[tile][done[tile] : done[tile] + len(core)]
-                done[tile] += len(core)
-            begin += len(block)
-        return out
 
 
 @dataclass(eq=False)
@@ -142,17 +99,16 @@ class InTiles:
         final_budget: int | None = None,
         gaps: bool = False,
         progress: Progress = silent,
-    ) -> MergedTiles:
+    ) -> Merged:
         """Merge the scene, see `Dense`; finished steps are in the folder of the workers.
 
         Flags of `protected` are those of a round before, of which a scene in tiles has none. Colours are
         fitted, and gaps measured, only if the result is in memory.
         """
-        done = simplify_tiles(self._run, count, views, final_budget)
-        merged = MergedTiles(done.splats, done.report, self.store, done.files)
+        merged = simplify_tiles(self._run, count, views, final_budget)
         if count > self.most_rows:
             return merged
-        small, report = done.splats.whole(), done.report
+        small, report = whole(merged.splats), merged.report
         if views is None or count == self.total:
             return replace(merged, splats=small)
         usual = usual_and_others(views)[0].resized(LONGEST)

@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g2ard.errors import InputError
-from g2ard.io.stream import PartsStream
+from g2ard.io.sanitize import BLOCK
+from g2ard.io.stream import PartsStream, SceneStream
 from g2ard.io.tile_store import TileStore
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats, unit_quats
@@ -33,13 +34,41 @@ class Merged:
     """A scene merged in tiles.
 
     Args:
-        splats: the scene, with fitted opacities; its identity is a hash of the names of its files.
+        splats: the scene, with fitted opacities; in tiles, its identity is a hash of the names of its files.
         files: results of `merge` or `reduce`; none if nothing was merged.
     """
 
-    splats: PartsStream
+    splats: Splats | PartsStream
     report: SimplifyReport
-    files: Sequence[Path] = ()
+    store: TileStore
+    files: Sequence[Path]
+
+    @property
+    def protected(self) -> NDArray[np.bool_] | None:
+        """(M,) protection flags, if the method has them."""
+        flags = [load(path, "protected")[0] for path in self.files if path.name.startswith("reduce")]
+        return np.concatenate(flags) if flags else None
+
+    def parents(self, scene: SceneStream) -> NDArray[np.int64]:
+        """Return (N,) the row in the result of each Gaussian, see `Simplified`.
+
+        Args:
+            scene: what was cut into the tiles, or they themselves: it gives the order of the rows.
+        """
+        rows = [tile.rows for tile in self.store.tiles]
+        counts = self.report.tiles or rows
+        parents = [load(path, "parents")[0] for path in self.files] or [np.arange(n) for n in rows]
+        before = np.cumsum([0, *counts])[:-1]
+        moved = [np.where(own < 0, -1, own + np.int64(n)) for own, n in zip(parents, before, strict=True)]
+        if scene.identity() == [self.store.key]:
+            return np.concatenate(moved)
+        out, done, begin = np.empty(self.store.count, np.int64), [0] * len(rows), 0
+        for block in scene.blocks(BLOCK):
+            for tile, (core, _) in enumerate(self.store.tree.route(block.means)):
+                out[begin + core] = moved[tile][done[tile] : done[tile] + len(core)]
+                done[tile] += len(core)
+            begin += len(block)
+        return out
 
 
 def simplify_tiles(
@@ -69,7 +98,7 @@ def simplify_tiles(
         )
     if budget == store.count:
         whole = scene_in_tiles(store, run.sizes, store.read, key_of(store.key), store.sh_degree)
-        return Merged(whole, _report(run, run.sizes, []))
+        return Merged(whole, _report(run, run.sizes, []), store, ())
     frame = run.sampled_frame()  # units that tiles share, so that their costs compare
     sights = None if views is None else Sights(run, views, frame)
     if isinstance(run.method, Paper):
@@ -93,7 +122,7 @@ def simplify_tiles(
         return finished(small, store.sh_degree)
 
     scene = scene_in_tiles(store, counts, tile, key_of(files), store.sh_degree)
-    return Merged(scene, _report(run, counts, merged, seen=sights is not None), merged)
+    return Merged(scene, _report(run, counts, merged, seen=sights is not None), store, merged)
 
 
 def _report(

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 import g2ard._core as _core
 from g2ard.io.tile_store import TileStore
 from g2ard.rendering.renderer import RasterSettings, view_of
-from g2ard.rendering.visibility import CONVERGED, NEAR, ROUND, SampledVisibility, spread
+from g2ard.rendering.visibility import NEAR, SampledVisibility, add_until_converged
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.prepared import PreparedScene, as_prepared, finite_rows_of
 from g2ard.scene.splats import Splats
@@ -172,18 +172,13 @@ def _add_until_converged(
     sums: _core.VisibilityAccumulator, cameras: Cameras, settings: RasterSettings, rows: int
 ) -> list[int]:
     """Add rounds of views until one finds few new of the first `rows` Gaussians; return the views."""
-    stride = max(1, math.ceil(len(cameras) / ROUND))
-    used: list[int] = []
-    seen = 0
-    for first in spread(stride):
-        views = range(first, len(cameras), stride)
+
+    def add(views: range) -> int:
         sums.add([view_of(cameras, i, settings) for i in views], settings, None)
-        used += views
-        tell_share(len(used) / max(1, len(cameras)))
-        before, seen = seen, int(np.count_nonzero(sums.by_row()[0][:rows]))
-        if len(used) > ROUND and seen - before < CONVERGED * rows:
-            break
-    return used
+        tell_share((views.start + 1) / views.step)
+        return int(np.count_nonzero(sums.by_row()[0][:rows]))
+
+    return [view for views in add_until_converged(add, len(cameras), rows) for view in views]
 
 
 def _median(values: NDArray[np.float32]) -> float:
