@@ -141,7 +141,7 @@ def run_(
     run.result({"rows": rows})
     failed = [row["error"] for row in rows if "error" in row]
     if failed:
-        run.unmet(
+        run.exit_unmet(
             f"{plural(len(failed), 'row')} failed; the same command tries again. The first: {failed[0]}"
         )
 

@@ -68,7 +68,9 @@ class Count:
         return cls.parse(text, shares=False)
 
     def budget(self) -> Budget:
-        return Budget(share=self.value) if isinstance(self.value, float) else Budget(count=self.value)
+        if isinstance(self.value, float):
+            return Budget(share=self.value)
+        return Budget(count=self.value)
 
     def __str__(self) -> str:
         return self.text

@@ -31,8 +31,12 @@ class Claims:
 
     def __init__(self, given: Iterable[Any], written: Collection[Any], overwrite: bool) -> None:
         self.overwrite = overwrite
-        paths = [p for value in given for p in (value if isinstance(value, list) else [value])]
-        self._inputs = [p for p in paths if isinstance(p, Path) and all(p is not w for w in written)]
+        self._inputs: list[Path] = []
+        outputs = set(map(id, written))  # by identity: an output may equal an input, which is refused later
+        for value in given:
+            for path in value if isinstance(value, list) else [value]:
+                if isinstance(path, Path) and id(path) not in outputs:
+                    self._inputs.append(path)
         self._outputs: dict[Path, tuple[str, bool]] = {}  # real path → option, whether all below is its own
 
     def claim(self, flag: str, *outputs: Path, folder: bool = False) -> None:
@@ -77,7 +81,7 @@ class Claims:
 
     def spare_inputs(self, *outputs: Path, flag: str = "--output") -> None:
         """Raise a usage error if an output is also an input, even with --overwrite."""
-        taken = {real_path(place) for path in self._inputs for place in (path, run_scene(path))}
+        taken = set(map(real_path, [*self._inputs, *map(run_scene, self._inputs)]))
         folders = {place for place in taken if place.is_dir()}
         for output in outputs:
             place = real_path(output)
@@ -122,10 +126,12 @@ class Claims:
     def input_files(self) -> list[Path]:
         """Return all files that the command reads: inputs, files in input folders, cameras that are found,
         photos, and what is found beside views."""
-        found = {*map(run_scene, self._inputs), *self._cameras}
-        inside = {path for folder in found if folder.is_dir() for path in folder.rglob("*")}
-        files = (path for path in found | inside | self._photos | self._beside if path.is_file())
-        return sorted(path for path in files if not self._writes(path))
+        named = {*map(run_scene, self._inputs), *self._cameras}
+        found = named | self._photos | self._beside
+        for path in named:
+            if path.is_dir():
+                found.update(path.rglob("*"))
+        return sorted(path for path in found if path.is_file() and not self._writes(path))
 
     def _writes(self, path: Path) -> bool:
         """Return whether a file is among the outputs, as in a folder of views that a run is written into."""

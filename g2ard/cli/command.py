@@ -129,7 +129,7 @@ def command(
 
     Args:
         parent: group it belongs to.
-        settings: config of --set as MODULE:CLASS, see `Run.settled`, or "" if the command checks it; None
+        settings: config of --set as MODULE:CLASS, see `Run.settle`, or "" if the command checks it; None
             takes no --set.
         fields: paths of its settings that flags set: those of `FIELDS`, or options named like them.
         scenes: whether it reads scenes and takes --render-model, see `Run.load`.
@@ -178,7 +178,7 @@ def command(
             run.typed = frozenset(name for name in values if is_typed(ctx, name))
             if printing:
                 if settings and run.config["set"]:
-                    run.settled(resolve_name(settings)(), run.config.get("preset"))
+                    run.settle(resolve_name(settings)(), run.config.get("preset"))
                 typer.echo(write_config(ctx, {**values, **shared_values, **run.config}), nl=False)
                 return
             with interrupt.RaisesInterrupt():

@@ -3,6 +3,7 @@
 import json
 import math
 import re
+from collections import ChainMap
 from collections.abc import Iterable
 from functools import partial
 from pathlib import Path
@@ -36,7 +37,7 @@ def load_config(ctx: typer.Context, path: Path | None) -> Path | None:
     commands = _find_parameters(ctx, path, tables)
     for other, table in tables.items():
         _check_keys(table, commands[other], f"{path}: `{other}` has no option")
-    anywhere = {flag: p for parameters in commands.values() for flag, p in parameters.items()}
+    anywhere = dict(ChainMap(*commands.values()))
     missing = "none of its commands has an option" if tables else f"`{name}` has no option"
     _check_keys(top, anywhere, f"{path}: {missing}")
     own = tables.get(name, {})
@@ -80,11 +81,13 @@ def _find_parameters(ctx: typer.Context, path: Path, tables: Iterable[str]) -> d
     for other in others:
         register_commands(other)
     commands: dict[str, Any] = getattr(typer.main.get_command(app), "commands", {}) if others else {}
-    taken = {other: commands[other] for other in others} | {name: ctx.command}
-    return {
-        command: {_write_dashes(flag.lstrip("-")): p for p in found.params for flag in (*p.opts, str(p.name))}
-        for command, found in taken.items()
-    }
+    found: dict[str, dict[str, Any]] = {}
+    for command in (name, *others):
+        found[command] = {}
+        for parameter in (ctx.command if command == name else commands[command]).params:
+            for flag in (*parameter.opts, str(parameter.name)):
+                found[command][_write_dashes(flag.lstrip("-"))] = parameter
+    return found
 
 
 def _check_keys(table: dict[str, Any], known: dict[str, Any], problem: str) -> None:

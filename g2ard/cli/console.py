@@ -79,7 +79,7 @@ def wrap(text: str) -> str:
     except (OSError, ValueError):
         return text
     wrapper = TextWrapper(columns or 80, break_long_words=False, break_on_hyphens=False)
-    return "\n".join(part for line in text.split("\n") for part in wrapper.wrap(line) or [""])
+    return "\n".join(wrapper.fill(line) for line in text.split("\n"))
 
 
 @dataclass
@@ -111,13 +111,16 @@ class _Stage:
     @property
     def share(self) -> float:
         """Share of this call's units that are done; 0 if their number is unknown."""
-        return (self.done - self.first) / (self.total - self.first) if self.total > self.first else 0.0
+        if self.total <= self.first:
+            return 0.0
+        return (self.done - self.first) / (self.total - self.first)
 
     def left(self, now: float) -> float | None:
         """Return the estimated seconds to the end, or None if they are unknown, or not yet settled."""
-        elapsed = now - self.began
         share = self.share
-        return elapsed / share * (1 - share) if self.settled and share > 0 else None
+        if not self.settled or share <= 0:
+            return None
+        return (now - self.began) / share * (1 - share)
 
 
 class Console:

@@ -65,7 +65,8 @@ def _open_streams() -> None:
         if getattr(sys, name) is None:
             stream = os.fdopen(number, "w" if number else "r", encoding="utf-8", closefd=False)
             setattr(sys, name, stream)
-        if number and isinstance(stream := getattr(sys, name), io.TextIOWrapper):
+        stream = getattr(sys, name)
+        if number and isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")
 
 

@@ -263,7 +263,7 @@ BackgroundOption = Annotated[
 
 
 def background_of(run: Run, given: Triple | None, *scenes: Path | None) -> Triple | None:
-    """Return --background, otherwise that of the first run among the scenes, for `run.settled` as well.
+    """Return --background, otherwise that of the first run among the scenes, for `run.settle` as well.
 
     None means the default.
     """

@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Callable, Sequence
+from itertools import chain
 from pathlib import Path
 
 import typer
@@ -26,8 +27,8 @@ def read_budgets(run: Run, *, optional: bool = False) -> list[Budget]:
         with run.usage():
             return [Budget(fit=fit, min_psnr=min_psnr, min_ssim=min_ssim)]
     if counts:
-        return [count.budget() for several in counts for count in several]
-    return [Budget(ratio=ratio) for several in ratios or [] for ratio in several]
+        return [count.budget() for count in chain.from_iterable(counts)]
+    return [Budget(ratio=ratio) for ratio in chain.from_iterable(ratios or [])]
 
 
 def read_budget(run: Run, *, optional: bool = False) -> Budget | None:
@@ -101,7 +102,7 @@ class Outputs:
         """
         if total is None and self._needs_total():
             return []
-        found = [Path(self._named(budget, total)) for budget in self._budgets]
+        found = [Path(self._fill_in(budget, total)) for budget in self._budgets]
         if len(set(found)) < len(found):
             raise typer.BadParameter(
                 f"{self._pattern}: two budgets have the same output; "
@@ -123,7 +124,7 @@ class Outputs:
             "{count}" in self._pattern and any(budget.count is None for budget in self._budgets)
         )
 
-    def _named(self, budget: Budget, total: int | None) -> str:
+    def _fill_in(self, budget: Budget, total: int | None) -> str:
         name = self._pattern
         if "{ratio}" in name:
             ratio = budget.ratio if budget.ratio is not None else (total or 0) / budget.of(total or 0)

@@ -74,7 +74,9 @@ _PANELS = {
 }
 """Topic → its options, in the order of `--help-all`."""
 
-_TOPICS = {name: topic for topic, names in _PANELS.items() for name in names}
+_TOPICS: dict[str, str] = {}
+for _topic, _names in _PANELS.items():
+    _TOPICS |= dict.fromkeys(_names, _topic)
 
 
 def ordered(command: str, parameters: list[Parameter]) -> list[Parameter]:

@@ -55,25 +55,32 @@ def check_same(run: Run, record: Mapping[str, Any], output: Path, *others: str) 
     """
     then = record.get("config", {})
     now = json.loads(json.dumps(run.config, default=str))
-    names = [name for name in now if name in then and name not in CALL_OPTIONS]
-    found = [*others, *(name.replace("_", "-") for name in names if now[name] != then[name])]
-    if found:
-        raise OutputError(
-            f"finished with other options ({', '.join(found)})",
-            path=output,
-            hint="-w without --resume starts over",
-        )
-    known = record.get("inputs", {})
+    different = list(others)
+    for name, value in now.items():
+        if name in then and name not in CALL_OPTIONS and value != then[name]:
+            different.append(name.replace("_", "-"))
+    hint = "-w without --resume starts over"
+    if different:
+        raise OutputError(f"finished with other options ({', '.join(different)})", path=output, hint=hint)
+    changed = _find_changed_files(run, record.get("inputs", {}))
+    if changed:
+        raise OutputError(f"finished before {min(changed)} changed", path=output, hint=hint)
+
+
+def _find_changed_files(run: Run, known: Mapping[str, Any]) -> list[str]:
+    """Return the files that a run reads and an earlier one found otherwise or not, or that are lost.
+
+    What is in a lost input is not read anew, so that it does not count.
+    """
     present = identify_files(run.input_files())
-    missing = [path for path in run.named_inputs() if not path.exists()]  # without them, nothing is read anew
-    gone = [Path(name) for name in known if name not in present and not Path(name).is_file()]
-    lost = [str(path) for path in gone if not {real_path(path), *real_path(path).parents} & set(missing)]
-    present |= identify_files(Path(name) for name in known if name not in present and Path(name).is_file())
-    changed = [name for name, identity in present.items() if identity != known.get(name)]
-    for name in sorted([*changed, *lost]):
-        raise OutputError(
-            f"finished before {name} changed", path=output, hint="-w without --resume starts over"
-        )
+    missing = {path for path in run.named_inputs() if not path.exists()}
+    lost = []
+    for path in map(Path, known.keys() - present.keys()):
+        if path.is_file():
+            present |= identify_files([path])
+        elif missing.isdisjoint({real_path(path), *real_path(path).parents}):
+            lost.append(str(path))
+    return lost + [name for name, identity in present.items() if identity != known.get(name)]
 
 
 def identify_files(files: Iterable[Path]) -> dict[str, Any]:
@@ -125,12 +132,14 @@ def began_output(place: Path, output: Path) -> bool:
 
     It left its lock or checkpoints, and everything in the output is younger.
     """
-    lock = lock_file(place.parent, _locked_name(place, output))
-    kept, written = (
-        [path.stat().st_mtime_ns for place in places for path in (place, *place.rglob("*")) if path.is_file()]
-        for places in ((place, lock), (output,))
-    )
-    return bool(kept) and output.exists() and all(min(kept) <= time for time in written)  # or none yet
+    kept = _list_times(place) + _list_times(lock_file(place.parent, _locked_name(place, output)))
+    written = _list_times(output)
+    return bool(kept) and output.exists() and min(kept) <= min(written, default=min(kept))
+
+
+def _list_times(place: Path) -> list[int]:
+    """Return when a file, or each file in a folder, was written last."""
+    return [path.stat().st_mtime_ns for path in (place, *place.rglob("*")) if path.is_file()]
 
 
 def drop_ended(run: Run, place: Path, resume: bool, output: Path) -> bool:
@@ -239,7 +248,11 @@ def tell_start(run: Run, place: Path, what: Path) -> None:
 
     done = list_finished_steps(place)
     steps = None if place.is_dir() else count_steps(place)
-    where = f"after {', '.join(done)}" if done else f"from {place if steps is None else f'step {steps:,}'}"
+    where = f"from {place}"
+    if done:
+        where = f"after {', '.join(done)}"
+    elif steps is not None:
+        where = f"from step {steps:,}"
     run.say(f"{what}: continues {where}")
 
 
@@ -251,7 +264,9 @@ def list_finished_steps(place: Path) -> list[str]:
 
 def has_checkpoints(place: Path) -> bool:
     """Return whether `place` is a checkpoint or a folder with checkpoints."""
-    return any(item.name != OPTIONS for item in place.iterdir()) if place.is_dir() else place.exists()
+    if not place.is_dir():
+        return place.exists()
+    return any(item.name != OPTIONS for item in place.iterdir())
 
 
 def _remove(place: Path) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from itertools import chain
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NoReturn
@@ -76,7 +77,7 @@ class Run(Claims):
         """Arguments of jobs that report progress and messages."""
         return {"progress": self.progress, "say": self.say}
 
-    def settled(self, config: Config, preset: str | None = None) -> tuple[dict[str, Any], Config]:
+    def settle(self, config: Config, preset: str | None = None) -> tuple[dict[str, Any], Config]:
         """Merge flags of settings and --set, which wins, into values by path and the config that they make.
 
         Args:
@@ -277,7 +278,7 @@ class Run(Claims):
         self.config |= {"scenes": scenes, "output": output}
         self._inputs = [path for path in self._inputs if path is not output]
 
-    def unmet(self, requirement: str) -> NoReturn:
+    def exit_unmet(self, requirement: str) -> NoReturn:
         """Exit with status 3: outputs are written, but a requirement is not met."""
         self.console.error(requirement)
         raise typer.Exit(3)
@@ -286,5 +287,5 @@ class Run(Claims):
 def _flat(value: Any) -> Any:
     """Flatten the budgets of a repeated option with several values each."""
     if isinstance(value, list) and value and all(isinstance(one, Counts | Ratios) for one in value):
-        return [budget for several in value for budget in several]
+        return list(chain.from_iterable(value))
     return value

@@ -87,15 +87,17 @@ class RunFolder:
     def check(self, budget: Budget | None) -> dict[str, Any] | None:
         """Return the report of a finished run if --resume finds one; raise an `OutputError` unless the run
         may write here."""
-        self._run.spare_inputs(self.scene, *self._other_scenes(), self._simplified, self._views, self._scored)
+        self._run.spare_inputs(
+            self.scene, *self._list_other_scenes(), self._simplified, self._views, self._scored
+        )
         check_unlocked(self.path)
         left = has_checkpoints(self.unfinished)
         killed = self.path.is_dir() and [path.name for path in self.path.iterdir()] == [_WORK_FOLDER]
         done = self._resume and not self._run.overwrite and not left
         done = done and self.scene.exists() and self._report.exists()
         if done:
-            record = self._finished(budget)
-            if not (lacking := self._lacking(record)):
+            record = self._read_finished(budget)
+            if not (lacking := self._find_lacking(record)):
                 self._run.say(f"{self.path}: already finished; -w without --resume starts over")
                 return record
             self._run.say(f"{self.path}: finished without {', '.join(lacking)}; the run is repeated")
@@ -106,7 +108,7 @@ class RunFolder:
             check_stopped(self._run, self.unfinished, self._resume, self.scene)
         return None
 
-    def _finished(self, budget: Budget | None) -> dict[str, Any]:
+    def _read_finished(self, budget: Budget | None) -> dict[str, Any]:
         """Return the finished run's report; raise an `OutputError` if its budget, options or input files were
         others."""
         record = read_json(self._report)
@@ -114,7 +116,7 @@ class RunFolder:
         assert isinstance(record, dict)
         return record
 
-    def _lacking(self, record: Mapping[str, Any]) -> list[str]:
+    def _find_lacking(self, record: Mapping[str, Any]) -> list[str]:
         """Return the options of this command whose files a finished run lacks."""
         then = record.get("config", {})
         now = self._run.config
@@ -126,7 +128,7 @@ class RunFolder:
         return [name for name, lacks in asked.items() if lacks]
 
     @contextmanager
-    def held(self, job: DistillJob) -> Iterator[None]:
+    def hold(self, job: DistillJob) -> Iterator[None]:
         """Create the folder, where no other run may write meanwhile; an empty folder is removed.
 
         It holds checkpoints too, which are kept after an error or Ctrl-C.
@@ -139,13 +141,13 @@ class RunFolder:
                 if self.scene.exists() and not (self._run.overwrite or has_checkpoints(self.unfinished)):
                     raise OutputError("exists", path=self.path, hint="{overwrite=True} replaces it")
                 drop_temporaries(self.path)
-                with self._checkpoints(job):
+                with self._hold_checkpoints(job):
                     yield
         finally:
             drop_empty(made)
 
     @contextmanager
-    def _checkpoints(self, job: DistillJob) -> Iterator[None]:
+    def _hold_checkpoints(self, job: DistillJob) -> Iterator[None]:
         """Create the folder for checkpoints; after an error or Ctrl-C, keep what it holds."""
         if self._resume and not has_checkpoints(self.unfinished):
             self._run.say(f"{self.path}: nothing to resume, starting over")
@@ -167,7 +169,7 @@ class RunFolder:
             (self.unfinished / "written").touch()  # from now on, --resume may replace this run's files
         run.write(self.scene, done.splats, overwrite=True, compare=False)
         pages = (self.path / name for name in ("report.json", "report.html", _PICTURE, "view.html"))
-        for other in (*self._other_scenes(), *pages):
+        for other in (*self._list_other_scenes(), *pages):
             other.unlink(missing_ok=True)
         if run.config["keep"]:
             self._simplified.parent.mkdir(exist_ok=True)
@@ -217,7 +219,7 @@ class RunFolder:
         with self._run.showing(_PICTURE):
             fill(best, self._run.progress)
             on_white = None
-            if job.renders and self._backdrop(recover.background, job.prior) is None:
+            if job.renders and self._choose_backdrop(recover.background, job.prior) is None:
                 on_white = partial(job.dense.images, background=WHITE)
             rows = range(len(best.cameras))
             shown = [draw_pictures(best, row, renderers, on_white, drawn) for row in rows]
@@ -270,7 +272,7 @@ class RunFolder:
         if count > most:
             return None, f"{self._view} skipped: over {most:,} Gaussians (`g2ard view` writes it anyway)"
         stand = frame_with(splats, cameras)
-        behind = self._backdrop(background, splats if dense is None else dense[1], of_points)
+        behind = self._choose_backdrop(background, splats if dense is None else dense[1], of_points)
         shown: list[Source | str] = [name_scenes([self.path])[0]]
         scenes = [splats]
         roles = [RESULT]
@@ -284,7 +286,7 @@ class RunFolder:
         return written, f"view: {self._view} ({written / 1e6:.2f} MB)"
 
     @staticmethod
-    def _backdrop(background: Colour, scene: Splats, of_points: bool = False) -> Colour | None:
+    def _choose_backdrop(background: Colour, scene: Splats, of_points: bool = False) -> Colour | None:
         """Return what is behind a scene in pictures and on pages, see `backdrop`."""
         return backdrop(None if background == BLACK else background, [scene], of_points=of_points)
 
@@ -298,7 +300,7 @@ class RunFolder:
         self._run.say("\n".join(filter(None, (scene, shown, report, page))))
         self._run.kept.append(f"{self.path} is finished")
 
-    def _other_scenes(self) -> list[Path]:
+    def _list_other_scenes(self) -> list[Path]:
         """Return the scene's file names in other formats."""
         names = (self.path / f"scene{suffix}" for suffix in SUFFIXES)
         return [path for path in names if path != self.scene]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -98,11 +99,16 @@ def list_remarks(report: RunReport, *, verbose: bool = False) -> list[str]:
     from g2ard.stages.simplify.gaps import RECOVERED_GAPS, gaps_line
 
     rounds = [entry.recover for entry in report.rounds]
+    recoveries = list(chain.from_iterable(rounds))
     lines = _compare_own_size(report)
-    lines += [describe_outcome(one) for entry in rounds for one in entry]
-    lines += [describe_time_limit(one) for entry in rounds[-1:] for one in entry[-1:]]
-    lines += [str(one.exposure) for entry in rounds for one in entry[-1:] if one.exposure]
-    lines += [describe_idle_regularizers(rounds)] if verbose else []
+    lines += map(describe_outcome, recoveries)
+    if rounds and rounds[-1]:
+        lines.append(describe_time_limit(recoveries[-1]))
+    for entry in rounds:
+        if entry and entry[-1].exposure:
+            lines.append(str(entry[-1].exposure))
+    if verbose:
+        lines.append(describe_idle_regularizers(rounds))
     start = "start" if report.photos else "simplified scene"
     lines += [
         describe_loss(kind, f"the {start} is better there (--keep writes it too)") for kind in report.kinds
@@ -209,5 +215,5 @@ def tell_quality(run: Run, budget: ResolvedBudget, splats: Splats) -> None:
         return
     met, line = judgement
     if not met:
-        run.unmet(line)
+        run.exit_unmet(line)
     run.say(line)

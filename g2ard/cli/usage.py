@@ -3,6 +3,7 @@
 import re
 import sys
 from collections.abc import Iterable, Mapping
+from itertools import chain
 from typing import Any, Literal
 
 import typer
@@ -63,9 +64,11 @@ def describe_usage_error(error: typer.TyperException) -> str:
     """Return the line for a usage error: typer's message, or a shorter one for an invalid value."""
     refused = getattr(error.__cause__, "errors", None)
     parameter: Any = getattr(error, "param", None)
-    if type(error).__name__ == "MissingParameter" and (missing := _list_missing(error)):
+    missing = _list_missing(error) if type(error).__name__ == "MissingParameter" else []
+    if missing:
         return f"missing {' and '.join(missing)}"
-    if (long := _find_single_dash(error)) is not None:
+    long = _find_single_dash(error)
+    if long is not None:
         return f"{long[1:]}: long options need two dashes; write {long}"
     if isinstance(error, typer.BadParameter) and parameter is None:  # a check of several options at once
         return error.message
@@ -84,25 +87,25 @@ def _list_missing(error: Any) -> list[str]:
     options = [p for p in error.ctx.command.params if p.param_type_name == "option"]
     if error.param not in options:
         return []
-    words = {part for word in sys.argv[1:] for part in (word.partition("=")[0], word[:2])}
-    typed = words | set(error.ctx.default_map or {})
-    found = [
-        f"{min(p.opts, key=len)} {p.metavar or p.name.upper()}"
-        for p in options
-        if p.required and not typed & {*p.opts, p.name}
-    ]
-    named = {p.name for p in options}  # all of them, as some commands have a budget for one option alone
-    budgets = {word for p in options if p.name in BUDGETS for word in (*p.opts, p.name)}
-    budgets = budgets if named >= BUDGETS.keys() else set()
-    return [*found, *([f"a budget ({BUDGET_FLAGS})"] if budgets and not budgets & typed else [])]
+    given = set(error.ctx.default_map or {})
+    for word in sys.argv[1:]:
+        given |= {word.partition("=")[0], word[:2]}
+    missing = [p for p in options if not given & {*p.opts, p.name}]
+    found = [f"{min(p.opts, key=len)} {p.metavar or p.name.upper()}" for p in missing if p.required]
+    if {p.name for p in missing} >= BUDGETS.keys():  # some commands have a budget for one option alone
+        found.append(f"a budget ({BUDGET_FLAGS})")
+    return found
 
 
 def _find_single_dash(error: typer.TyperException) -> str | None:
     """Return a long option that was typed with a single dash, if any."""
     command: Any = getattr(getattr(error, "ctx", None), "command", None)
-    long = {flag for parameter in getattr(command, "params", ()) for flag in parameter.opts}
-    words = (f"-{word.partition('=')[0]}" for word in sys.argv[1:] if len(word) > 2)
-    return next((word for word in words if re.match(r"--\w", word) and word in long), None)
+    known = set(chain.from_iterable(parameter.opts for parameter in getattr(command, "params", ())))
+    for word in sys.argv[1:]:
+        long = f"-{word.partition('=')[0]}"
+        if len(word) > 2 and re.match(r"--\w", long) and long in known:
+            return long
+    return None
 
 
 def is_typed(ctx: typer.Context, name: str) -> bool:
@@ -122,10 +125,11 @@ def _describe_allowed(parameter: Any) -> str:
     kinds = {bool: "true or false", int: "a whole number", float: "a number"}
     low = descriptor.parameter_info.min
     high = descriptor.parameter_info.max
-    bounds = {
-        (True, True): f" from {low} to {high}",
-        (True, False): f" of at least {low}",
-        (False, True): f" of at most {high}",
-        (False, False): "",
-    }
-    return kinds.get(descriptor.annotation, "another value") + bounds[low is not None, high is not None]
+    kind = kinds.get(descriptor.annotation, "another value")
+    if low is None and high is None:
+        return kind
+    if low is None:
+        return f"{kind} of at most {high}"
+    if high is None:
+        return f"{kind} of at least {low}"
+    return f"{kind} from {low} to {high}"

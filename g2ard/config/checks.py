@@ -35,12 +35,12 @@ class Within:
     interval: str
 
     def __contains__(self, value: float) -> bool:
-        low, high = _ends(self.interval)
+        low, high = _parse_ends(self.interval)
         above = value >= low if self.interval[0] == "[" else value > low
         return above and (value <= high if self.interval[-1] == "]" else value < high)
 
     def __str__(self) -> str:
-        low, high = _ends(self.interval)
+        low, high = _parse_ends(self.interval)
         if math.isfinite(high):
             return f"in {self.interval}"
         if math.isinf(low):
@@ -49,7 +49,7 @@ class Within:
 
 
 @cache
-def _ends(interval: str) -> tuple[float, float]:
+def _parse_ends(interval: str) -> tuple[float, float]:
     low, high = interval[1:-1].split(",")
     return float(low), float(high)
 
@@ -66,7 +66,7 @@ AtLeastOne = Annotated[int, Within("[1, inf)")]
 def check_fields(config: Any) -> None:
     """Reject the first value of a dataclass that does not have the type of its field."""
     owner: Any = type(config)
-    kinds = _hints(owner)
+    kinds = _find_hints(owner)
     for field in fields(config):
         _check(field.name, getattr(config, field.name), kinds[field.name])
 
@@ -147,7 +147,7 @@ def checks_arguments(function: Callable[P, Result]) -> Callable[P, Result]:
 
     @wraps(function)
     def checked(*args: P.args, **kwargs: P.kwargs) -> Result:
-        kinds = _hints(function)
+        kinds = _find_hints(function)
         unknown = [] if loose else [name for name in kwargs if name not in signature.parameters]
         if unknown:
             near = nearest(unknown[0], [name for name in signature.parameters if name != "self"])
@@ -172,7 +172,9 @@ def nearest(name: str, listed: Iterable[str], known: Iterable[str] | None = None
     """
     listed = list(listed)
     close = get_close_matches(name, sorted(listed if known is None else known), 1)
-    return f"did you mean {close[0]}?" if close else f"expected one of {', '.join(listed)}"
+    if close:
+        return f"did you mean {close[0]}?"
+    return f"expected one of {', '.join(listed)}"
 
 
 def signature_of(other: Callable[P, Any]) -> Callable[[Callable[..., Result]], Callable[P, Result]]:
@@ -201,7 +203,9 @@ def described(kind: Any) -> str:
         return f"one of {', '.join(map(str, get_args(kind)))}{_REMARKS.get(kind, '')}"
     if get_origin(kind) is tuple:
         kinds = get_args(kind)
-        return "comma-separated numbers" if kinds[-1] is Ellipsis else f"{len(kinds)} comma-separated numbers"
+        if kinds[-1] is Ellipsis:
+            return "comma-separated numbers"
+        return f"{len(kinds)} comma-separated numbers"
     if get_origin(kind) is Sequence:
         return "several numbers" if get_args(kind) == (float,) else "several values"
     words: dict[Any, str] = {
@@ -240,7 +244,7 @@ _ARRAY_NAMES = {"ArrayLike": _Array, "NDArray": _Array}
 
 
 @cache
-def _hints(owner: Any) -> dict[str, Any]:
+def _find_hints(owner: Any) -> dict[str, Any]:
     """Return the types of fields or arguments; `object` for names imported for type checkers only."""
     if isinstance(owner, type):
         return get_type_hints(owner, localns=_ARRAY_NAMES, include_extras=True)

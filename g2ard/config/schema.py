@@ -49,10 +49,10 @@ class Settings:
         kind = cls
         name = None
         if cls._tag is not None and cls not in cls._variants.values():
-            given = dict(zip(_names(cls), first, strict=False)) | values
+            given = dict(zip(_list_names(cls), first, strict=False)) | values
             name = given.get(cls._tag, next(iter(cls._variants)))
             kind = cls._variant(name)
-        for other in values.keys() - _names(kind).keys():
+        for other in values.keys() - _list_names(kind).keys():
             raise kind._unknown(other, name)
         return object.__new__(kind)
 
@@ -69,9 +69,11 @@ class Settings:
     @classmethod
     def _unknown(cls, name: str, own: str | None) -> InputError:
         """Return the error for a field that does not exist, or exists in variants other than `own` only."""
-        others = [other for other, kind in cls._variants.items() if name in _names(kind)]
+        others = [other for other, kind in cls._variants.items() if name in _list_names(kind)]
         if not others:
-            return InputError("is no setting", parameter=name, hint=f"there are {', '.join(_names(cls))}")
+            return InputError(
+                "is no setting", parameter=name, hint=f"there are {', '.join(_list_names(cls))}"
+            )
         own = own or next(variant for variant, kind in cls._variants.items() if kind is cls)
         reason = f"has no effect on the {cls._tag} {own}, only on {' and '.join(others)}"
         return InputError(reason, parameter=name)
@@ -84,11 +86,11 @@ class Settings:
         kind = self._variant(name)
         usual = type(self)(**{tag: getattr(self, tag)})
         changed = {field: value for field, value in vars(self).items() if value != getattr(usual, field)}
-        kept = {field: value for field, value in changed.items() if field in _names(kind)}
+        kept = {field: value for field, value in changed.items() if field in _list_names(kind)}
         return kind(**{**kept, tag: name})
 
 
-def _names(kind: Any) -> dict[str, None]:
+def _list_names(kind: Any) -> dict[str, None]:
     return dict.fromkeys(f.name for f in fields(kind))
 
 
@@ -102,13 +104,13 @@ def parse_settings(texts: Iterable[str], config: Any) -> dict[str, Any]:
     >>> parse_settings(["regularizers.anchor=1e-3", "period=50", "schedule=fast"], RecoverConfig())
     {'recover.regularizers.anchor': 0.001, 'recover.regularizers.period': 50, 'recover.schedule': 'fast'}
     """
-    known = {leaf.path: leaf for leaf in _leaves(config, every=True)}
+    known = {leaf.path: leaf for leaf in _list_leaves(config, every=True)}
     values: dict[str, Any] = {}
     for text in texts:
         name, equals, value = text.partition("=")
         if not equals:
             raise InputError(f"expected PATH=VALUE, got {text!r}")
-        path = _full(name.strip(), known)
+        path = _expand(name.strip(), known)
         values[path] = _read(path, value.strip(), known[path].kind)
     return values
 
@@ -120,10 +122,10 @@ def full_paths(values: Mapping[str, Any], config: Any) -> dict[str, Any]:
     >>> full_paths({"rates.means": 1e-3, "steps": 100}, RecoverConfig())
     {'recover.schedule.rates.means': 0.001, 'recover.steps': 100}
     """
-    known = {leaf.path: leaf for leaf in _leaves(config, every=True)}
+    known = {leaf.path: leaf for leaf in _list_leaves(config, every=True)}
     found = {}
     for name, value in values.items():
-        path = _full(name, known)
+        path = _expand(name, known)
         if get_origin(known[path].kind) is tuple and hasattr(value, "tolist"):
             value = tuple(value.tolist())
         if not hasattr(known[path].value, "named"):
@@ -138,7 +140,7 @@ def keywords(function: Callable[..., Any], config: Any, given: Mapping[str, Any]
     A name that is neither an argument nor the end of a path of `config` is answered by the nearest of these.
     """
     arguments = [name for name, p in signature(function).parameters.items() if p.kind is not p.VAR_KEYWORD]
-    paths = {leaf.path for leaf in _leaves(config, every=True)}
+    paths = {leaf.path for leaf in _list_leaves(config, every=True)}
     known = {*arguments, *(path.rpartition(".")[2] for path in paths)}
     for name in given:
         if name not in known and name not in paths and "." not in name:
@@ -159,7 +161,7 @@ def changed(config: Config, values: Mapping[str, Any]) -> Config:
     >>> config.schedule.rates.means, config.schedule.round_steps
     (0.001, 8000)
     """
-    return _changed(config, _root(config), values)
+    return _change(config, _name_root(config), values)
 
 
 def listed(config: Any) -> dict[str, Any]:
@@ -183,7 +185,7 @@ def values_of(config: Any) -> dict[str, Any]:
     >>> changed(RecoverConfig(), values_of(config)) == config
     True
     """
-    return {leaf.path: leaf.value for leaf in _leaves(config) if not is_dataclass(leaf.value)}
+    return {leaf.path: leaf.value for leaf in _list_leaves(config) if not is_dataclass(leaf.value)}
 
 
 @dataclass(frozen=True)
@@ -195,62 +197,62 @@ class _Leaf:
     value: Any
 
 
-def _leaves(config: Any, root: str | None = None, every: bool = False) -> Iterator[_Leaf]:
+def _list_leaves(config: Any, root: str | None = None, every: bool = False) -> Iterator[_Leaf]:
     """List what can be set; with `every`, also in other variants."""
-    root = _root(config) if root is None else root
+    root = _name_root(config) if root is None else root
     owner: Any = type(config)
-    kinds = _kinds(owner)
+    kinds = _find_kinds(owner)
     for f in fields(config):
-        path = _joined(root, f.name)
+        path = _join(root, f.name)
         value = getattr(config, f.name)
         if is_dataclass(value):
             if hasattr(value, "named"):
                 yield _Leaf(path, str, value)
             if not (every and f.metadata.get("whole")):
-                yield from _leaves(value, path, every)
+                yield from _list_leaves(value, path, every)
         elif f.metadata.get("setting", True):
             chosen = every and f.name == getattr(config, "_tag", None)
             yield _Leaf(path, Literal[tuple(config._variants)] if chosen else kinds[f.name], value)
     for kind in getattr(config, "_variants", {}).values() if every else ():
-        kinds = _kinds(kind)
+        kinds = _find_kinds(kind)
         for f in fields(kind):
-            if f.name not in _names(config):
-                yield _Leaf(_joined(root, f.name), kinds[f.name], f.default)
+            if f.name not in _list_names(config):
+                yield _Leaf(_join(root, f.name), kinds[f.name], f.default)
 
 
 @cache
-def _kinds(config: type) -> dict[str, Any]:
+def _find_kinds(config: type) -> dict[str, Any]:
     return get_type_hints(config, include_extras=True)
 
 
-def _root(config: Any) -> str:
+def _name_root(config: Any) -> str:
     if all(is_dataclass(getattr(config, f.name)) for f in fields(config)):
         return ""
     kinds = [kind for kind in type(config).__mro__ if vars(kind).get("_tag")] or [type(config)]
     return kinds[0].__name__.removesuffix("Config").lower()
 
 
-def _joined(root: str, name: str) -> str:
+def _join(root: str, name: str) -> str:
     return f"{root}.{name}" if root else name
 
 
-def _changed(config: Any, root: str, values: Mapping[str, Any]) -> Any:
+def _change(config: Any, root: str, values: Mapping[str, Any]) -> Any:
     new: dict[str, Any] = {}
     if isinstance(config, Settings) and config._tag is not None:
         try:
-            chosen = values.get(_joined(root, config._tag), getattr(config, config._tag))
+            chosen = values.get(_join(root, config._tag), getattr(config, config._tag))
             config = config.turned(chosen)
             for kind in config._variants.values():
-                for name in _names(kind):
-                    if name not in _names(config) and _joined(root, name) in values:
+                for name in _list_names(kind):
+                    if name not in _list_names(config) and _join(root, name) in values:
                         raise config._unknown(name, chosen)
         except InputError as error:
-            raise error.at(parameter=_joined(root, str(error.parameter))) from None
+            raise error.at(parameter=_join(root, str(error.parameter))) from None
     for f in fields(config):
-        path = _joined(root, f.name)
+        path = _join(root, f.name)
         held = getattr(config, f.name)
         if is_dataclass(held) and not isinstance(held, type):
-            inner = _changed(_whole(held, values.get(path, held), path), path, values)
+            inner = _change(_resolve_whole(held, values.get(path, held), path), path, values)
             if inner != held:
                 new[f.name] = inner
         elif path in values:
@@ -262,10 +264,10 @@ def _changed(config: Any, root: str, values: Mapping[str, Any]) -> Any:
     except InputError as error:
         if error.parameter not in new:
             raise
-        raise error.at(parameter=_joined(root, error.parameter)) from None
+        raise error.at(parameter=_join(root, error.parameter)) from None
 
 
-def _whole(held: Any, value: Any, path: str) -> Any:
+def _resolve_whole(held: Any, value: Any, path: str) -> Any:
     """Return the config that `value` names, or `value` itself if it is a config."""
     if not isinstance(value, str):
         return value
@@ -275,7 +277,7 @@ def _whole(held: Any, value: Any, path: str) -> Any:
         raise error.at(parameter=path) from None
 
 
-def _full(name: str, known: Mapping[str, Any]) -> str:
+def _expand(name: str, known: Mapping[str, Any]) -> str:
     """Expand a path or an unambiguous tail of one."""
     if name in known:
         return name
@@ -288,7 +290,9 @@ def _full(name: str, known: Mapping[str, Any]) -> str:
         raise InputError(f"ambiguous setting {name!r}; use {' or '.join(same)}")
     prefix, _, last = name.rpartition(".")
     close = get_close_matches(last, sorted({path.rpartition(".")[2] for path in known}), 3, 0.6)
-    near = [path for word in close for path in known if path.endswith(f".{word}")]
+    near = []
+    for word in close:
+        near += [path for path in known if path.endswith(f".{word}")]
     if near:
         raise InputError(f"unknown setting {name!r}; did you mean {' or '.join(near)}?")
     within = [path for path in known if path.startswith(f"{prefix}.")]
@@ -298,13 +302,13 @@ def _full(name: str, known: Mapping[str, Any]) -> str:
 def _read(path: str, text: str, kind: Any) -> Any:
     for option in options_of(kind):
         try:
-            return _as(option, text)
+            return _parse(option, text)
         except ValueError:
             continue
     raise InputError(f"expected {described(kind)}, got {text!r}", parameter=path)
 
 
-def _as(kind: Any, text: str) -> Any:
+def _parse(kind: Any, text: str) -> Any:
     """Parse `text` as one type, or raise ValueError."""
     kind = bare(kind)
     if get_origin(kind) is Literal and text in get_args(kind):
@@ -314,8 +318,8 @@ def _as(kind: Any, text: str) -> Any:
         text = text.strip("()[]")
         if kinds[-1] is Ellipsis:
             mark = ";" if get_origin(kinds[0]) is tuple else ","
-            return tuple(_as(kinds[0], part.strip()) for part in text.split(mark) if part.strip())
-        return tuple(_as(k, part.strip()) for k, part in zip(kinds, text.split(","), strict=True))
+            return tuple(_parse(kinds[0], part.strip()) for part in text.split(mark) if part.strip())
+        return tuple(_parse(k, part.strip()) for k, part in zip(kinds, text.split(","), strict=True))
     if kind is type(None) and text.lower() == "none":
         return None
     if kind is bool and text.lower() in ("true", "false"):

@@ -153,7 +153,8 @@ def hidden_name(name: str, ending: str) -> str:
     >>> hidden_name("a.ply", ".tiles"), len(hidden_name(250 * "a", ".tiles"))
     ('.a.ply.tiles', 255)
     """
-    room, data = _LONGEST_NAME - len(os.fsencode(f".{ending}")), os.fsencode(name)
+    room = _LONGEST_NAME - len(os.fsencode(f".{ending}"))
+    data = os.fsencode(name)
     if len(data) > room:
         digest = sha256(data).hexdigest()[:16]
         name = data[: max(0, room - len(digest))].decode(errors="ignore") + digest
@@ -183,7 +184,8 @@ def atomic_folder(path: AnyPath, overwrite: bool = False) -> AbstractContextMana
 @contextmanager
 def _renamed(path: Path, overwrite: bool, *, folder: bool) -> Iterator[Path]:
     target = _target(path)
-    temporary, made = _beside(target), parents_made(target)
+    temporary = _beside(target)
+    made = parents_made(target)
     try:
         if folder:
             temporary.mkdir()

@@ -37,7 +37,8 @@ class Stream(PointStream):
     """
 
     def __init__(self, path: Path) -> None:
-        header, self.path = read_header(path), path
+        header = read_header(path)
+        self.path = path
         self._named = scene_names(header.properties("vertex"))
         require(list(self._named), _POSITION, "a point cloud")
         self.fields = tuple(self._named)
@@ -62,7 +63,8 @@ class Stream(PointStream):
             self.lack = "needs the vertex properties 'red', 'green', 'blue' of a coloured point cloud, or "
             self.lack += f"intensities {found}; rename its colours if they have other names"
         if not choices and is_mesh(header):
-            self.lack, self.todo = "is a mesh without colours at its vertices", MESH
+            self.lack = "is a mesh without colours at its vertices"
+            self.todo = MESH
 
     def raw(self, rows: int, start: int) -> Iterator[MarkedPoints]:
         for _, block in row_blocks(self.path, self._vertices, rows, start):
@@ -85,7 +87,8 @@ class Stream(PointStream):
 def _color(path: Path, values: Values, name: str) -> Float32:
     finite = values[np.isfinite(values)] if values.dtype.kind == "f" else values
     scales = full_scales(values.dtype)
-    low, top = float(finite.min(initial=0)), float(finite.max(initial=0))
+    low = float(finite.min(initial=0))
+    top = float(finite.max(initial=0))
     if low < (-0.5 if values.dtype.kind == "f" else 0) or top > scales[-1] * 1.001:
         beyond = low if low < 0 else top
         raise InputError(f"has a value of {beyond:g}, expected [0, {scales[-1]:g}]", path=path, property=name)

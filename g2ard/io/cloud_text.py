@@ -80,12 +80,16 @@ def _text(text: str) -> tuple[list[str], Float]:
     Of a table whose heading names x, y and z, only known columns are read, and their names are the first.
     """
     text = text.replace("\r\n", "\n").replace("\r", "\n").replace('"', "")
-    names, heading, first = list[str](), "", 0
+    names = list[str]()
+    heading = ""
+    first = 0
     for number, line in enumerate(text.split("\n", _LINES)):
         words = re.findall(r"\w+", line.lower())
-        first, named = number, {"x", "y", "z"} <= set(names)
+        first = number
+        named = {"x", "y", "z"} <= set(names)
         if not named and any(re.match(r"[a-df-z_]|e\w", word) for word in words if word != "nan"):
-            names, heading = _names(line), line
+            names = _names(line)
+            heading = line
         elif len(words) > 1 and re.match(r"\s*[^\s#/%].*\d", line):
             break
     rows = text.split("\n", first)[-1]
@@ -127,9 +131,11 @@ def _unnamed(table: Float) -> list[str]:
     if grid and (count > 6 or whole[5:] == [True]):
         return ["row", "column", *_unnamed(table[:, 2:])]  # of a scan's grid, as FARO writes them
     names = ["x", "y", "z", *(["intensity"] if count == 4 else [f"column_{k + 1}" for k in range(3, count)])]
-    found, alike = list[tuple[bool, bool, int]](), dict[int, float]()
+    found = list[tuple[bool, bool, int]]()
+    alike = dict[int, float]()
     for start in _TRIPLES.get(count, ()):
-        values, top = table[:, start : start + 3], table[:, start : start + 3].max(initial=0)
+        values = table[:, start : start + 3]
+        top = table[:, start : start + 3].max(initial=0)
         if values.min(initial=0) >= 0 and ((all(whole[start : start + 3]) and top <= 65535) or top <= 1):
             varying = bool(np.ptp(values, axis=0).all())
             found.append((not varying, top > 255, start))
@@ -151,18 +157,21 @@ def _pcd(path: Path) -> tuple[list[str], Float]:
     found = re.search(rb"^DATA[ \t]+(\w+)[ \t]*\r?\n", data, re.MULTILINE)
     if found is None:
         raise damaged("has no line DATA")
-    how, body = found[1].decode().lower(), data[found.end() :]
+    how = found[1].decode().lower()
+    body = data[found.end() :]
     words = [line.split() for line in data[: found.start()].decode("latin-1").splitlines()]
     head = {line[0]: line[1:] for line in words if line}
     try:
-        fields, count = head["FIELDS"], int(head["POINTS"][0])
+        fields = head["FIELDS"]
+        count = int(head["POINTS"][0])
         shapes = zip(head["TYPE"], head["SIZE"], head.get("COUNT") or "1" * len(fields), strict=True)
         rows = np.dtype(
             [(f"{i}", f"<{kind.lower()}{size}", (int(n),)) for i, (kind, size, n) in enumerate(shapes)]
         )
         if how == "ascii":
             values = np.loadtxt(io.StringIO(plain_numbers(body.decode("latin-1"))), ndmin=2)
-            table, at = np.zeros(len(values), rows), 0
+            table = np.zeros(len(values), rows)
+            at = 0
             for name in rows.names or ():
                 table[name] = values[:, at : (at := at + table[name].shape[1])]
         elif how == "binary":
@@ -174,7 +183,8 @@ def _pcd(path: Path) -> tuple[list[str], Float]:
         raise
     except (KeyError, ValueError, IndexError, TypeError) as error:
         raise damaged(f"cannot be read as .pcd ({error})") from error
-    names, columns = list[str](), list[Float]()
+    names = list[str]()
+    columns = list[Float]()
     for field, name in zip(fields, rows.names or (), strict=False):
         own = table[name].reshape(len(table), -1)
         if field.lower() in ("rgb", "rgba") and own.dtype.itemsize == 4:

@@ -90,7 +90,8 @@ def _count(folder: Path) -> int:
 
 def models_below(path: Path) -> list[Path]:
     """Return the folders of models up to three levels below a folder, the nearest first."""
-    level, found = [path], list[Path]()
+    level = [path]
+    found = list[Path]()
     for _ in range(3):
         inner = [sorted(p for p in folder.iterdir() if p.is_dir())[:_MOST_FOLDERS] for folder in level]
         level = [folder for folders in inner for folder in folders][:_MOST_FOLDERS]
@@ -120,7 +121,8 @@ def points_file(path: Path) -> Path | None:
 
 def numbers_of(folder: Path, names: Sequence[str]) -> set[int]:
     """Return the numbers by which points name some images of the model in a folder."""
-    tables, wanted = _tables(folder), set(names)
+    tables = _tables(folder)
+    wanted = set(names)
     if tables is None:
         return set()
     with parsing(tables[1]):
@@ -139,7 +141,8 @@ def _tables(folder: Path) -> tuple[Path, Path] | None:
     """Return the files of cameras and images, binary before text; None if either is missing."""
     held = _held(folder)
     for suffix in (".bin", ".txt"):
-        cameras, images = held.get(f"cameras{suffix}"), held.get(f"images{suffix}")
+        cameras = held.get(f"cameras{suffix}")
+        images = held.get(f"images{suffix}")
         if cameras and images:
             return cameras, images
     return None
@@ -180,7 +183,8 @@ def read(views: ViewFiles) -> Listed:
     several models in numbered folders, the one with the most images is read, unless `path` is one.
     """
     path = views.path
-    found, beside = listed(views), photos_beside(path)
+    found = listed(views)
+    beside = photos_beside(path)
     others = [other for other in _models(beside[0] if beside else path) if other != found.path]
     if not others:
         return found
@@ -191,7 +195,8 @@ def read(views: ViewFiles) -> Listed:
 
 def listed(views: ViewFiles) -> Listed:
     """Return the frames of `read`, without a note on other models."""
-    path, images = views.path, views.images
+    path = views.path
+    images = views.images
     if images is None and (beside := photos_beside(path)):
         path, images = beside
     folder = model_folder(path)
@@ -207,8 +212,10 @@ def listed(views: ViewFiles) -> Listed:
         raise InputError("has no images", path=tables[1])
     names = [name for name, *_ in images_read]
     finder = Finder(images) if images else Finder.among(names, *_photo_folders(path, folder))
-    frames, faults = list[Frame](), list[tuple[str, InputError]]()
-    by_rig, stale = _rig_poses(folder, tables[1].suffix.lower()), 0
+    frames = list[Frame]()
+    faults = list[tuple[str, InputError]]()
+    by_rig = _rig_poses(folder, tables[1].suffix.lower())
+    stale = 0
     for name, key, number, own, fault in sorted(images_read, key=lambda image: image[0]):
         if number not in cameras:
             raise InputError(f"{name!r} has the unknown camera {number}", path=tables[1])
@@ -277,8 +284,11 @@ class Table:
     """A binary table, read one value after the other. Iterating yields the index of each row, an `item`."""
 
     def __init__(self, path: Path, item: str) -> None:
-        self.path, self.item, self.row = path, item, 0
-        self.data, self._at = path.read_bytes(), 0
+        self.path = path
+        self.item = item
+        self.row = 0
+        self.data = path.read_bytes()
+        self._at = 0
         (self.count,) = self.take(_COUNT)
 
     def __iter__(self) -> Iterator[int]:
@@ -309,7 +319,8 @@ class Table:
         end = self.data.find(b"\0", self._at)
         if end < 0:
             raise self._cut_off("NAME")
-        start, self._at = self._at, end + 1
+        start = self._at
+        self._at = end + 1
         return self.data[start:end].decode(errors="surrogateescape")
 
     def skip_points(self) -> None:
@@ -317,7 +328,8 @@ class Table:
 
     def skip(self, size: int, name: str) -> bytes:
         """Move past the bytes of a column, and return them."""
-        start, self._at = self._at, self._at + size
+        start = self._at
+        self._at = self._at + size
         if self._at > len(self.data):
             raise self._cut_off(name)
         return self.data[start : self._at]
@@ -338,14 +350,19 @@ class TextTable(Table):
     """A table of lines of words, without comments."""
 
     def __init__(self, path: Path, item: str) -> None:
-        self.path, self.item, self.row = path, item, -1
+        self.path = path
+        self.item = item
+        self.row = -1
         lines = read_text(path).splitlines()
-        self._lines, self._next = [line for line in lines if not line.startswith("#")], 0
-        self.words, self._at = list[str](), 0
+        self._lines = [line for line in lines if not line.startswith("#")]
+        self._next = 0
+        self.words = list[str]()
+        self._at = 0
 
     def __iter__(self) -> Iterator[int]:
         while self._next < len(self._lines):
-            self.words, self._at = self._lines[self._next].split(maxsplit=_SPLITS.get(self.item, -1)), 0
+            self.words = self._lines[self._next].split(maxsplit=_SPLITS.get(self.item, -1))
+            self._at = 0
             self._next += 1
             if self.words:
                 self.row += 1
@@ -463,7 +480,8 @@ def _rig_poses(folder: Path, suffix: str) -> dict[tuple[int, int], Float]:
     camera_from_world = sensor_from_rig · rig_from_world. Poses that are unknown or not finite are missing.
     """
     held = _held(folder)
-    rigs, frames = held.get(f"rigs{suffix}"), held.get(f"frames{suffix}")
+    rigs = held.get(f"rigs{suffix}")
+    frames = held.get(f"frames{suffix}")
     if rigs is None or frames is None:
         return {}
     with parsing(rigs):

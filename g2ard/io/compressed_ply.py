@@ -78,12 +78,15 @@ class Stream(RawStream):
         for name in _PACKED:
             if vertex.dtype[name] != np.uint32:
                 raise InputError(f"has type {vertex.dtype[name]}, expected uint", property=name)
-        offset, mode = offset_of(header), render_model_of(header.comments)
+        offset = offset_of(header)
+        mode = render_model_of(header.comments)
         model: RenderModel = "antialiased" if mode == "antialiased" else "classic"
         super().__init__(path, len(vertex), len(rest) // 3, offset, render_model=model)
         self.up = up_of(header.comments)
         self.restore(axes_of(header))
-        self._vertex, self._sh, self._rest = vertex, sh[0] if sh else None, len(rest) // 3
+        self._vertex = vertex
+        self._sh = sh[0] if sh else None
+        self._rest = len(rest) // 3
         self._bounds = np.tile([[0.0] * 3, [1.0] * 3], (len(chunk), 3, 1, 1))
         stored = structured_to_unstructured(np.asarray(chunk)[bounds]).reshape(len(chunk), -1, 2, 3)
         self._bounds[:, : len(bounds) // 6] = stored
@@ -180,7 +183,8 @@ def _packed(values: Float, bits: tuple[int, ...]) -> NDArray[np.uint32]:
 
 def _unpacked(words: Values, bits: tuple[int, ...]) -> Float:
     """Return the (N, C) values in [0, 1] that `_packed` takes."""
-    values, shift = np.empty((len(words), len(bits))), 0
+    values = np.empty((len(words), len(bits)))
+    shift = 0
     for k, width in reversed(list(enumerate(bits))):
         top = (1 << width) - 1
         values[:, k] = (words >> np.uint32(shift) & np.uint32(top)) / top

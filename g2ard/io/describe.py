@@ -40,14 +40,17 @@ def describe(given: str | Path | ViewFiles, more: Callable[[Splats], Json] | Non
     path = source.path
     if source.kind == "splats":
         splats = source.whole()
-        notes, figures = source.notes, _splats(splats) | ({} if more is None else more(splats))
+        notes = source.notes
+        figures = _splats(splats) | ({} if more is None else more(splats))
     elif source.kind == "points":
         cloud = source.cloud().whole()
-        notes, figures = cloud.notes, _points(cloud.points)
+        notes = cloud.notes
+        figures = _points(cloud.points)
     else:
         views = read_view_set(given)
         views = replace(views, splits=splits_of(path, views.cameras.names, views.splits))
-        notes, figures = (*views.notes, *_photo_notes(views.cameras)), _views(views)
+        notes = (*views.notes, *_photo_notes(views.cameras))
+        figures = _views(views)
     system = source.map_system
     figures |= {} if system is None else {"map_system": system}
     if source.kind == "points":

@@ -71,7 +71,8 @@ class Finder:
     """
 
     def __init__(self, *folders: Path, notes: Notes = ()) -> None:
-        self._folders, self.notes = tuple(dict.fromkeys(folders)), notes
+        self._folders = tuple(dict.fromkeys(folders))
+        self.notes = notes
         self._listings: dict[Path, tuple[dict[str, Path], dict[str, Path]]] = {}
 
     @classmethod
@@ -80,7 +81,8 @@ class Finder:
         half of them: one of `around`, or a folder in these. A few like names may be of other photos."""
         from g2ard.io.types import Note
 
-        asked, expected = names[:: max(1, len(names) // _ASKED)], cls(*folders)
+        asked = names[:: max(1, len(names) // _ASKED)]
+        expected = cls(*folders)
         if any(map(expected.find, asked)):
             return expected
         roots = [root for root in dict.fromkeys(around) if root.is_dir()]
@@ -154,7 +156,8 @@ class Finder:
 
 def _keys(name: str) -> list[list[str]]:
     """Return what a file may be found by, the strictest first."""
-    folded, others = _folded(name), [_folded(_stem(other)) for other in _respelled(name)]
+    folded = _folded(name)
+    others = [_folded(_stem(other)) for other in _respelled(name)]
     stem = f"stem {_folded(_stem(name))}"
     return [[f"exact {name}"], [f"name {folded}"], [stem], [f"other {other}" for other in others]]
 

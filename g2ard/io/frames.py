@@ -107,7 +107,9 @@ class Listed(NamedTuple):
 
     def noted(self, code: str, count: int, text: str) -> Listed:
         """Return the views with a further note, if it counts anything."""
-        return self._replace(notes=(*self.notes, Note(code, count, text))) if count else self
+        if count:
+            return self._replace(notes=(*self.notes, Note(code, count, text)))
+        return self
 
     def whole(self) -> Sequence[Frame]:
         """Return the frames, or raise the error of the first view that is left out."""
@@ -152,7 +154,8 @@ def make_pose(quat: ArrayLike, translation: ArrayLike) -> Float:
 
 
 def invert_pose(matrix: Float) -> Float:
-    R, t = matrix[:3, :3], matrix[:3, 3]
+    R = matrix[:3, :3]
+    t = matrix[:3, 3]
     out = np.eye(4)
     out[:3, :3], out[:3, 3] = R.T, -R.T @ t
     return out
@@ -250,7 +253,8 @@ def _split_into_pinholes(frame: Frame) -> list[Frame]:
 
 def _find_idle_masks(present: Sequence[Frame]) -> list[Path]:
     """Return folders of masks for the first photo that hold images."""
-    photo, name = present[0].photo, present[0].listed or present[0].name
+    photo = present[0].photo
+    name = present[0].listed or present[0].name
     folders = mask_folders(photo, len(plain_parts(name))) if photo else []
     return [folder for folder, _ in folders if photos_in(folder, below=True)]
 
@@ -269,10 +273,12 @@ _PHOTO_NOTES = {
 
 def _check_photos(frames: Sequence[Frame]) -> tuple[list[Frame], list[Note]]:
     """Drop photos that cannot be read, and photos that names of several folders were shortened to."""
-    out, found = list(frames), {code: list[str]() for code in _PHOTO_NOTES}
+    out = list(frames)
+    found = {code: list[str]() for code in _PHOTO_NOTES}
     times = Counter(frame.photo for frame in frames)
     for i, frame in enumerate(frames):
-        photo, wanted = frame.photo, Path(frame.listed)
+        photo = frame.photo
+        wanted = Path(frame.listed)
         if photo is None or not usable(photo):
             continue
         if (what := describe_unreadable(photo)) is not None:

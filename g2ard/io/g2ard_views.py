@@ -47,12 +47,14 @@ class _View(msgspec.Struct):
 
 def read(given: ViewFiles) -> Listed:
     """Read views; photo paths are relative to the file unless `images`, a folder of photos, is given."""
-    path, images = given.path, given.images
+    path = given.path
+    images = given.images
     content = read_own(path, _FORMAT, _VERSION).get("views", [])
     views = checked(content, list[_View], Place(path).to("views"), entries="view")
     if not views:
         raise InputError("no views found ('views' is empty)", path=path)
-    finder, masks = Finder(images or path.parent), Finder(path.parent)
+    finder = Finder(images or path.parent)
+    masks = Finder(path.parent)
     return Listed(path, [_frame(Place(path, i, "view"), view, finder, masks) for i, view in enumerate(views)])
 
 

@@ -95,7 +95,8 @@ def _plain(path: Path, splats: Splats) -> list[bytes]:
     attributes = _attributes(splats)
     views: list[Json] = []
     accessors: list[Json] = []
-    blobs, start = [], 0
+    blobs = []
+    start = 0
     for name, values in attributes.items():
         blob = values.tobytes()
         blob += b"\0" * (-len(blob) % 4)
@@ -126,7 +127,8 @@ def spz_glb(path: Path, splats: Splats, centre: Float | None = None) -> tuple[li
 
     The node's translation is the scene's `offset`, and `centre`, which makes coordinates small.
     """
-    movable, centre = centre is not None, np.zeros(3) if centre is None else centre
+    movable = centre is not None
+    centre = np.zeros(3) if centre is None else centre
     bits = spz.fraction_bits(path, splats.means.astype(float) - centre, splats, movable=movable)
     splats = splats.take(packing_order(splats.means))
     means = (splats.means.astype(float) - centre) * (-1, 1, -1)
@@ -351,7 +353,9 @@ def _scene(path: Path, document: _Document, binary: bytes) -> Noted:
         raise InputError(f"holds {held}: no primitive has {EXTENSION}", hint=hint)
     text = f"{plural(others, 'other primitive')} ignored"
     found = restored(found[0], _axes(document.nodes)), found[1]
-    return (found[0], (Note("ignored_meshes", others, text), *found[1])) if others else found
+    if others:
+        return (found[0], (Note("ignored_meshes", others, text), *found[1]))
+    return found
 
 
 def _axes(nodes: list[_Node]) -> Axes:
@@ -382,7 +386,9 @@ def _shown(path: Path, document: _Document, binary: bytes) -> Iterator[tuple[Not
 
 def placed(parts: Iterable[tuple[Noted, Float]]) -> Noted | None:
     """Join parts by their (4, 4) placements, in the axes of a .ply; return None without parts."""
-    moved, notes, uneven = list[Splats](), list[Note](), 0
+    moved = list[Splats]()
+    notes = list[Note]()
+    uneven = 0
     for (part, own), placement in parts:
         notes += [note for note in own if note not in notes]
         try:
@@ -435,7 +441,9 @@ def _attributes_of(place: Place, document: _Document, binary: bytes, names: Json
             place.to(name), document, binary, checked(names[name], Whole, place.to(name)), name, width
         )
 
-    own, base, opacity = list(names), f"{EXTENSION}:SH_DEGREE_0_COEF_0", f"{EXTENSION}:OPACITY"
+    own = list(names)
+    base = f"{EXTENSION}:SH_DEGREE_0_COEF_0"
+    opacity = f"{EXTENSION}:OPACITY"
     names = {f"{EXTENSION}:{name[1:]}" if name.startswith("_") else name: at for name, at in names.items()}
     degree = max(d for d in range(4) if d == 0 or f"{EXTENSION}:SH_DEGREE_{d}_COEF_0" in names)
     means = values("POSITION", 3)
@@ -522,13 +530,15 @@ def _placements(path: Path, nodes: list[_Node], mesh: int, seen: set[int]) -> li
     holders = [i for i, node in enumerate(nodes) if node.mesh == mesh]
     for shown in (i for i in holders if i in seen):
         at: int | None = shown
-        total, above = np.eye(4), set[int]()
+        total = np.eye(4)
+        above = set[int]()
         with np.errstate(over="ignore", invalid="ignore"):
             while at is not None:
                 if at in above:
                     raise InputError(f"node {at} is its own ancestor")
                 above.add(at)
-                total, at = _local(nodes[at]) @ total, parents.get(at)
+                total = _local(nodes[at]) @ total
+                at = parents.get(at)
         if not np.isfinite(total[:3, 3]).all():
             raise InputError(f"invalid translation {tuple(total[:3, 3].tolist())}")
         found.append(total * np.outer((*_GLTF_TURN, 1), (*_GLTF_TURN, 1)))

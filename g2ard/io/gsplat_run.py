@@ -31,7 +31,8 @@ def read(views: ViewFiles) -> Listed:
     principal axes, whose signs depend on the linear algebra library, and do not store the transform. Without
     `images`, photos are in the data's `images_N` for `data_factor` N, or `images`.
     """
-    path, images = views.path, views.images
+    path = views.path
+    images = views.images
     file = path / NAME if path.is_dir() else path
     settings = read_settings(file)
     if settings.word("data_type") not in (None, "colmap"):
@@ -44,7 +45,8 @@ def read(views: ViewFiles) -> Listed:
             path=file,
             hint="train with --no-normalize-world-space, or give cameras in the scene's world",
         )
-    named, data = settings.path("data_dir"), data_of(path)
+    named = settings.path("data_dir")
+    data = data_of(path)
     if named is None or data is None:
         text = f"data_dir {named and named.as_posix()} does not exist"
         raise InputError(text, path=file, hint="give its COLMAP folder as views, or correct data_dir")

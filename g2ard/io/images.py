@@ -39,7 +39,8 @@ def _average(image: Float32, length: int, axis: int) -> Float32:
     edges = np.linspace(0, count, length + 1)
     below = np.minimum(edges.astype(int), count - 1)
     share = np.expand_dims(edges - below, [i for i in range(3) if i != axis])
-    low, high = sums.take(below, axis), sums.take(below + 1, axis)
+    low = sums.take(below, axis)
+    high = sums.take(below + 1, axis)
     return (np.diff(low + share * (high - low), axis=axis) * (length / count)).astype(np.float32)
 
 

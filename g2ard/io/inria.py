@@ -35,10 +35,12 @@ def read(views: ViewFiles) -> Listed:
     as in INRIA's trainer. The id is appended to repeated names, such as r_0 of each split of NeRF's synthetic
     scenes. Without `images`, photos are in `images` beside the file.
     """
-    path, images = views.path, views.images
+    path = views.path
+    images = views.images
     file = path / NAME if path.is_dir() else path
     listed = checked(read_any_json(file), list[_Camera], Place(file), entries="camera")
-    beside, names = images or file.parent / "images", [camera.img_name for camera in listed]
+    beside = images or file.parent / "images"
+    names = [camera.img_name for camera in listed]
     among = Finder(beside) if images else Finder.among(names, [beside], [file.parent])
     finder = among if beside.is_dir() or among.notes else None
     frames = [_frame(Place(file, i, "camera"), camera, finder) for i, camera in enumerate(listed)]

@@ -46,7 +46,8 @@ def bulk_range(values: Values) -> tuple[float, float]:
     finite = values[np.isfinite(values)]
     if not finite.size:
         return 0.0, 0.0
-    low, high = np.quantile(finite, 1 - _BULK, method="lower"), np.quantile(finite, _BULK, method="higher")
+    low = np.quantile(finite, 1 - _BULK, method="lower")
+    high = np.quantile(finite, _BULK, method="higher")
     return float(low), float(high)
 
 
@@ -76,7 +77,9 @@ def note_coarse(positions: Values, apart: float) -> Notes:
         f"coordinates are rounded to steps of {step:g} by float32, which is coarse for points {apart:.2g} "
         "apart; export them as float64 (.las, .laz, .e57), or with a shift (CloudCompare's Global Shift)"
     )
-    return (Note("coarse_positions", len(positions), text),) if step > _FINE * apart > 0 else ()
+    if step > _FINE * apart > 0:
+        return (Note("coarse_positions", len(positions), text),)
+    return ()
 
 
 def spacing(positions: Values, count: int) -> float:
@@ -102,7 +105,9 @@ def choose_shades(values: Values, limits: tuple[float, float] | None = None) -> 
 def has_contrast(values: Values) -> bool:
     """Return whether colours (n, 3) are not all black, or intensities (n, 1) vary."""
     finite = values[np.isfinite(values).all(axis=1)]
-    return bool(finite.any() if values.shape[1] == 3 else np.ptp(finite) > 0) if finite.size else False
+    if finite.size:
+        return bool(finite.any() if values.shape[1] == 3 else np.ptp(finite) > 0)
+    return False
 
 
 @dataclass(frozen=True)
@@ -145,7 +150,8 @@ def judge_storage(
     count, (small, large), (faint, solid) = len(opacities), bulk_range(scales), bulk_range(opacities)
     enough = count >= _FEWEST
     told: list[str] = []
-    opaque, notes = None if logs else 1.0, list[Note]()
+    opaque = None if logs else 1.0
+    notes = list[Note]()
     if faint >= 0 and solid > 0 and _are_whole(opacities):
         opaque = choose_white(opacities[:, None], full_scales(opacities.dtype)) if solid > 1 else 1.0
         if opaque > 1:
@@ -158,7 +164,8 @@ def judge_storage(
     elif not logs and (past := int(np.sum(np.abs(opacities - 0.5) > 0.5 + _ROUNDING))):
         text = f"{plural(past, 'opacity', 'opacities')} past [0, 1] clamped"
         notes.append(Note("opacities", past, text))
-    log_scales, unequal = logs, small < large or math.exp(min(small, 1)) > _WIDE * apart
+    log_scales = logs
+    unequal = small < large or math.exp(min(small, 1)) > _WIDE * apart
     if not logs and small < 0:
         log_scales = True
         notes.append(Note("log_scales", count, "scales are below 0, so all are taken as logarithms"))

@@ -40,8 +40,10 @@ def read(path: Path) -> Noted:
         raise damaged("is cut off within its header")
     if data[0] != 0 or data[1] < 1:
         raise InputError(f"unsupported version {data[0]}.{data[1]}; expected 0.1")
-    words, floats = np.frombuffer(data, "<u4", 11), np.frombuffer(data, "<f4", 11)
-    level, sections = int(words[5] & 0xFFFF), int(words[1])
+    words = np.frombuffer(data, "<u4", 11)
+    floats = np.frombuffer(data, "<f4", 11)
+    level = int(words[5] & 0xFFFF)
+    sections = int(words[1])
     if level not in (0, 1, 2):
         raise InputError(f"unsupported compression level {level}; expected 0, 1 or 2")
     limits = tuple(float(given) or usual for given, usual in zip(floats[9:11], _SH_RANGE, strict=True))
@@ -53,7 +55,8 @@ def read(path: Path) -> Noted:
         raw, at = _rows(data, i, at, _section(data, i), level, limits)
         parts.append(raw)
     rest = max((raw.shN.shape[1] for raw in parts), default=0)
-    whole, start = Raw.empty(sum(len(raw.means) for raw in parts), rest), 0
+    whole = Raw.empty(sum(len(raw.means) for raw in parts), rest)
+    start = 0
     whole.shN[:] = 0
     for raw in parts:
         whole.take(slice(start, start := start + len(raw.means))).fill(vars(raw).values())
@@ -75,7 +78,8 @@ def _rows(
     """Return the rows of section `i`, which begins at byte `at`, and the byte after it."""
     packed = "<f4" if level == 0 else "<u2"
     real = "<f4" if level == 0 else "<f2"
-    harmonics, count = _SH_COUNTS[section["degree"]], min(section["count"], section["capacity"])
+    harmonics = _SH_COUNTS[section["degree"]]
+    count = min(section["count"], section["capacity"])
     row = np.dtype(
         [
             ("mean", packed, 3),

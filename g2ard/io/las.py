@@ -40,7 +40,8 @@ class Stream(PointStream):
 
     def __init__(self, path: Path) -> None:
         with _opened(path) as reader:
-            count, header = reader.header.point_count, reader.header
+            count = reader.header.point_count
+            header = reader.header
             self.fields = tuple(header.point_format.dimension_names)
             choices = [names for names in (_RGB, ("intensity",)) if {*self.fields}.issuperset(names)]
             runs = []
@@ -56,7 +57,9 @@ class Stream(PointStream):
 
         self._color, sample = telling(choices, sampled)
         super().__init__(path, count, sample, full_scales(np.dtype(np.uint16)), notes=notes)
-        self.system, self.axes, self.metres_per_unit = system, "RFU", metres_per_unit
+        self.system = system
+        self.axes = "RFU"
+        self.metres_per_unit = metres_per_unit
         if choices[0] != _RGB:
             number = header.point_format.id
             self.lack = (
@@ -88,7 +91,8 @@ _UNITS = {9001: 1.0, 9002: 0.3048, 9003: 1200 / 3937}
 
 def _map_of(header: Any) -> tuple[str | None, float | None]:
     """Return the map system that a header states, by EPSG code or name, and the metres of its unit."""
-    systems, units = list[str](), list[float]()
+    systems = list[str]()
+    units = list[float]()
     for record in header.vlrs:
         if record.record_id == 34735 and hasattr(record, "geo_keys"):
             codes = {key.id: key.value_offset for key in record.geo_keys}
@@ -162,7 +166,8 @@ def _check_records(path: Path) -> None:
     """Check the number of variable-length records against the file's size, since laspy tries to read all."""
     if (begin := _number(path, 0, "4s")) != b"LASF":
         raise InputError(f"cannot be read as LAS (begins with {begin!r})")
-    points_at, records = _number(path, 96, "<I"), _number(path, 100, "<I")
+    points_at = _number(path, 96, "<I")
+    records = _number(path, 100, "<I")
     extended = _number(path, 243, "<I") if _number(path, 25, "<B") >= 4 else 0
     size = path.stat().st_size
     if points_at > size:
@@ -178,7 +183,8 @@ def _check_count(there: int, promised: int) -> None:
 
 def _check_chunk_table(path: Path, points_at: int, promised: int) -> None:
     """Check the number of chunks against points and bytes, since lazrs aborts when out of memory."""
-    table, size = _number(path, points_at, "<q"), path.stat().st_size
+    table = _number(path, points_at, "<q")
+    size = path.stat().st_size
     if table == -1:  # streamed file: the offset is at its end
         table = _number(path, size - 8, "<q")
     if not points_at < table <= size - 8:
@@ -198,7 +204,8 @@ def _check_chunks(path: Path, header: Any) -> None:
     if not records:
         raise damaged("broken header: the LASzip record is missing")
     layout = lazrs.LazVlr(records[0].record_data)
-    size, wanted = layout.item_size(), header.point_format.size
+    size = layout.item_size()
+    wanted = header.point_format.size
     if size != wanted:
         raise damaged(f"broken header: compressed points of {size} bytes, not {wanted}")
     if not layout.uses_variable_size_chunks():

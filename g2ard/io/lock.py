@@ -45,7 +45,8 @@ def locked(folder: Path, output: str | None = None) -> Iterator[None]:
     File systems without locks are not locked.
     """
     path = lock_file(folder, output)
-    file, shown = _opened(path), folder if output is None else folder / output
+    file = _opened(path)
+    shown = folder if output is None else folder / output
     while not _held(path, file, shown):  # removed by its holder after it was opened
         os.close(file)
         file = _opened(path)

@@ -120,7 +120,8 @@ def _saved(views: ViewFiles, options: Settings | None) -> tuple[Sequence[Frame],
 
 def _split(frames: Sequence[Frame], options: Settings) -> Sequence[Frame]:
     """Assign the run's split by `eval_mode` over sorted photo paths, if views are split at all."""
-    count, mode = len(frames), options.word("eval_mode")
+    count = len(frames)
+    mode = options.word("eval_mode")
     order = sorted(range(count), key=lambda i: frames[i].photo or Path(frames[i].name))
     rank = np.argsort(order)
     if mode == "fraction":

@@ -38,10 +38,12 @@ def read(views: ViewFiles) -> Listed:
     `path` is one of the lists, or the folder of both. Intrinsics come from a transforms.json or a COLMAP
     model above the photos, scaled to the photos' size.
     """
-    path, images = views.path, views.images
+    path = views.path
+    images = views.images
     files = exported(path) if path.is_dir() else [path]
     lenses: dict[Path, dict[str, Lens]] = {}
-    frames, finder = [], Finder(images) if images else None
+    frames = []
+    finder = Finder(images) if images else None
     for file in files:
         listed = checked(read_any_json(file), list[_Camera], Place(file), entries="camera")
         frames += [
@@ -53,7 +55,8 @@ def read(views: ViewFiles) -> Listed:
 def _frame(
     place: Place, camera: _Camera, finder: Finder | None, lenses: dict[Path, dict[str, Lens]]
 ) -> Frame:
-    path, file_path = place.path, Path(camera.file_path)
+    path = place.path
+    file_path = Path(camera.file_path)
     world_from_camera = make_rigid(np.array(camera.transform), place.to("transform"))
     there = below(path, file_path)
     ups = (below(path, up) for up in file_path.parents[:3] if up.parts)

@@ -61,7 +61,9 @@ def as_packed(path: Path, splats: Splats) -> Splats:
     """
     form = as_stored(writable(path, splats))
     middle = np.rint(np.median(form.means.astype(float), axis=0))
-    return form.recentred(form.offset + middle) if np.abs(middle).max() > FAR_FROM_ORIGIN else form
+    if np.abs(middle).max() > FAR_FROM_ORIGIN:
+        return form.recentred(form.offset + middle)
+    return form
 
 
 def packing_order(means: Values, chunk: int = 1) -> NDArray[np.intp]:
@@ -88,7 +90,8 @@ def packing_order(means: Values, chunk: int = 1) -> NDArray[np.intp]:
 
 def morton_order(means: Values) -> NDArray[np.intp]:
     """Return rows in Morton order (2²¹ cells per axis, ties by row)."""
-    low, high = means.min(axis=0).astype(float), means.max(axis=0).astype(float)
+    low = means.min(axis=0).astype(float)
+    high = means.max(axis=0).astype(float)
     size = max(float((high - low).max()), np.finfo(float).tiny)
     cells = ((means - low) / size * ((1 << _MORTON_BITS) - 1)).astype(np.uint64)
     code = np.zeros(len(means), np.uint64)
@@ -141,7 +144,8 @@ def smallest_three(quats: Float) -> tuple[NDArray[np.intp], Float]:
 
 def from_smallest_three(largest: Values, others: Float) -> Float:
     """Return the (N, 4) unit quaternions that `smallest_three` takes apart."""
-    quats, rows = np.empty((len(others), 4)), np.arange(len(others))
+    quats = np.empty((len(others), 4))
+    rows = np.arange(len(others))
     quats[rows[:, None], _OTHER_COMPONENTS[largest]] = others
     quats[rows, largest] = np.sqrt(np.maximum(0, 1 - (others**2).sum(axis=1)))
     return quats

@@ -23,7 +23,8 @@ from g2ard.scene.samples import evenly_spaced
 def decode_photo(path: Path, like: Size | None = None) -> Float32:
     """Decode a photo as (H, W, 3) sRGB, or as premultiplied (H, W, 4) RGBA; for `like` see `needs_turn`."""
     with open_image(path) as stored:
-        wide, upright = _is_deep(stored), needs_turn(stored, like)
+        wide = _is_deep(stored)
+        upright = needs_turn(stored, like)
         image = ImageOps.exif_transpose(stored) if upright else stored
         if image.mode == "F":
             values = np.asarray(image)[..., None]
@@ -92,7 +93,8 @@ def _choose_white(folder: Path, suffix: str, brightest: int) -> float:
 @lru_cache(maxsize=64)
 def _find_brightest(folder: Path, suffix: str) -> int:
     """Return the brightest value of a few photos of 16 bits in a folder; 0 if each has one colour."""
-    files, found = files_in(folder, suffix.lower()), 0
+    files = files_in(folder, suffix.lower())
+    found = 0
     for i in evenly_spaced(len(files), _SAMPLED_PHOTOS, floor=True):
         with suppress(InputError, OSError), open_image(files[i]) as image:
             if _is_deep(image):

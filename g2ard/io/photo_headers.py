@@ -127,7 +127,8 @@ def read_focal(path: Path) -> float | None:
     """
     try:
         with open_image(path) as image:
-            size, tags = image.size, image.getexif().get_ifd(_EXIF)
+            size = image.size
+            tags = image.getexif().get_ifd(_EXIF)
     except InputError:
         return None
     with suppress(TypeError, ValueError, ZeroDivisionError):

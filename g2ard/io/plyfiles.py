@@ -84,7 +84,8 @@ def _header(head: bytes) -> PlyHeader:
         raise damaged("broken PLY header: no end_header line")
     eol = b"\r\n" if head[3:5] == b"\r\n" else head[3:4]
     head = head[: end.start(1) + len(eol)]  # rows may begin with a newline
-    span, head = range(start, start + len(head)), head.translate(_ASCII)
+    span = range(start, start + len(head))
+    head = head.translate(_ASCII)
     try:
         counts = {name.decode(): int(count) for _, name, count in _COUNT.findall(head)}
         ply = PlyData.read(io.BytesIO(_COUNT.sub(rb"\g<1>0", head)), mmap=False)
@@ -103,7 +104,8 @@ class _Plain(io.BufferedReader):
         self.seek(span.start)
 
     def read(self, size: int | None = -1, /) -> bytes:
-        data, within = super().read(size), self.tell() <= self._end
+        data = super().read(size)
+        within = self.tell() <= self._end
         return data.translate(_ASCII) if within else data
 
 
@@ -185,7 +187,8 @@ def up_of(comments: Sequence[str]) -> tuple[float, float, float] | None:
     found = next((m for c in reversed(comments) if (m := _VERTICAL_AXIS.match(c))), None)
     if found is None:
         return None
-    axis, letter = np.zeros(3), re.fullmatch(r"([+-]?)([xyz])", found[2].lower())
+    axis = np.zeros(3)
+    letter = re.fullmatch(r"([+-]?)([xyz])", found[2].lower())
     if letter:
         writers = " ".join(comments).lower()
         named = "brush" in writers or not re.search("nerf?studio", writers)
@@ -269,7 +272,8 @@ def _read(
 ) -> PlyData:
     with _Plain(path, header.span) as file:
         if plain:
-            head, body = file.read(len(header.span)), file.read().decode("latin-1")
+            head = file.read(len(header.span))
+            body = file.read().decode("latin-1")
             return PlyData.read(io.BytesIO(head + plain_numbers(body).encode("latin-1")))
         return PlyData.read(file, mmap="r", known_list_len=list_lengths)
 

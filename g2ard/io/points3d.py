@@ -48,8 +48,10 @@ class Stream(HeldPoints):
 
 def _binary(path: Path, numbers: set[int]) -> Float:
     """Read x y z, r g b of placed points, from rows of id, these, error and a track of variable length."""
-    table, kept = Table(path, "point"), 0
-    count, size = table.count, len(table.data)
+    table = Table(path, "point")
+    kept = 0
+    count = table.count
+    size = len(table.data)
     if count * _POINT.packed.size > size:
         raise damaged(f"truncated: {count:,} points in {size:,} bytes")
     rows = np.empty((count, 6))

@@ -40,7 +40,8 @@ def read(views: ViewFiles) -> Listed:
     """Read the keyframes of a capture: fx, fy, cx, cy, width, height, and rows t_00 … t_23 of
     world_from_camera in OpenGL axes, metres, y up.
     """
-    path, images = views.path, views.images
+    path = views.path
+    images = views.images
     folders = cameras_in(path)
     if folders is None:
         raise InputError("has no keyframes/cameras with .json files")

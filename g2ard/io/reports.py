@@ -76,7 +76,9 @@ def plain(value: Any) -> Any:
 def _nested(value: Any) -> Any:
     if isinstance(value, Report):
         return value.as_dict()
-    return [_nested(item) for item in value] if isinstance(value, list | tuple) else value
+    if isinstance(value, list | tuple):
+        return [_nested(item) for item in value]
+    return value
 
 
 def _brief(value: Any, most: int) -> str:
@@ -86,4 +88,6 @@ def _brief(value: Any, most: int) -> str:
         return text
     if isinstance(value, Report):
         return f"{type(value).__name__}(…)"
-    return plural(len(value), "item") if isinstance(value, list | tuple | dict) else f"{text[: most - 1]}…"
+    if isinstance(value, list | tuple | dict):
+        return plural(len(value), "item")
+    return f"{text[: most - 1]}…"

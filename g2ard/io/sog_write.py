@@ -165,7 +165,8 @@ def _means(splats: Splats) -> tuple[Float, Float, NDArray[np.int64]]:
     """Return the bounds of the logarithms per axis, and (N, 3) 16-bit codes between them."""
     means = splats.means.astype(float)
     logs = np.sign(means) * np.log1p(np.abs(means))
-    low, high = logs.min(axis=0), logs.max(axis=0)
+    low = logs.min(axis=0)
+    high = logs.max(axis=0)
     return low, high, coded((logs - low) / np.where(high > low, high - low, 1.0), 65535)
 
 

@@ -41,7 +41,9 @@ class Source:
         render_model: RenderModel | None = None,
         others: Sequence[Path] = (),
     ) -> None:
-        self.path, self.file, self.render_model = Path(path), run_scene(path), render_model
+        self.path = Path(path)
+        self.file = run_scene(path)
+        self.render_model = render_model
         self.others = tuple(Source(other, render_model) for other in others)
         self.through: Callable[[PointStream], PointStream] | None = None
 

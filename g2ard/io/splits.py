@@ -194,7 +194,8 @@ def same_photos(files: Sequence[Path | None], others: Sequence[Path | None], *, 
     known = {real_path(path) for path in others if path is not None}
     alike = np.array([path is not None and real_path(path) in known for path in files], bool)
     if copies:
-        sizes, hashes = {_size(path) for path in known}, set[str]()
+        sizes = {_size(path) for path in known}
+        hashes = set[str]()
         for row, path in enumerate(files):
             if path is not None and not alike[row] and _size(path) in sizes - {None}:
                 hashes = hashes or {content_hash(other) for other in known if _size(other) is not None}

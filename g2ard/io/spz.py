@@ -145,7 +145,10 @@ def _comment(data: bytes) -> bytes:
 
 def _extensions(data: bytes) -> tuple[Axes, bytes, int]:
     """Return the axes that the records of version 4 name, g2ard's own record, and the number of others."""
-    axes, own, others, at = _ADOBE_AXES[3], b"", 0, _HEADER_4
+    axes = _ADOBE_AXES[3]
+    own = b""
+    others = 0
+    at = _HEADER_4
     (end,) = struct.unpack_from("<I", data, 16)
     while at + 8 <= min(end, len(data)):
         kind, size = struct.unpack_from("<II", data, at)
@@ -209,7 +212,8 @@ def _zstd_streams(data: bytes, stream_count: int, sizes: list[int]) -> list[byte
         entries = [struct.unpack_from("<QQ", data, table + 16 * i) for i in range(stream_count)]
     except struct.error as error:
         raise damaged("truncated: the table of streams is cut off") from error
-    streams, start = [], table + 16 * stream_count
+    streams = []
+    start = table + 16 * stream_count
     entries += [(0, 0)] * len(sizes)
     for i, (size, (packed, unpacked)) in enumerate(zip(sizes, entries, strict=False)):
         if start + packed > len(data):
@@ -330,7 +334,8 @@ def encoded(
     The `comment`, text, is in the gzip header, or in version 4 a record that other readers skip.
     """
     streams = _streams(splats, means, bits, spz_version)
-    flags, records = _ANTIALIASED if splats.antialiased else 0, b""
+    flags = _ANTIALIASED if splats.antialiased else 0
+    records = b""
     if axes != "RUB":
         flags |= _HAS_EXTENSIONS
         records = struct.pack("<III", _COORDINATE_SYSTEM, 4, _ADOBE_AXES.index(axes) + 1)
@@ -356,7 +361,8 @@ def encoded(
 
 def _gzipped(content: bytes, progress: Progress, comment: bytes) -> bytes:
     """Return what `gzip.compress(content, 9, mtime=0)` does, with a comment in the header."""
-    packer, parts = zlib.compressobj(9, wbits=31), []
+    packer = zlib.compressobj(9, wbits=31)
+    parts = []
     for start in range(0, len(content), _GZIP_BLOCK):
         progress("pack", start, len(content))
         parts.append(packer.compress(content[start : start + _GZIP_BLOCK]))

@@ -19,7 +19,9 @@ class Settings:
     """A block of settings: the lines of the file, the block's first line, and the spaces before its keys."""
 
     def __init__(self, lines: list[str], first: int = 0, indent: int = 0) -> None:
-        self._lines, self._first, self._indent = lines, first, indent
+        self._lines = lines
+        self._first = first
+        self._indent = indent
 
     def word(self, key: str) -> str | None:
         """Return a value as text without quotes; None if it is missing, null, empty or an object."""
@@ -74,7 +76,8 @@ class Settings:
         return self._lines[at].strip()[len(key) + 1 :].strip()
 
     def _items(self, at: int) -> list[str]:
-        indent, items = _indent(self._lines[at]), []
+        indent = _indent(self._lines[at])
+        items = []
         for line in self._lines[at + 1 :]:
             if _indent(line) < indent or not line.strip().startswith("- "):
                 break
@@ -92,7 +95,8 @@ def below(start: Path, path: Path) -> Path | None:
     Trainers write paths relative to where they ran, usually a folder above their output. Of a run that was
     copied with its data from another system, the longest end of the path that exists there is taken.
     """
-    folders, parts = real_path(start).parents, plain_parts(str(path))
+    folders = real_path(start).parents
+    parts = plain_parts(str(path))
     if found := next((place / path for place in (*folders, Path()) if (place / path).exists()), None):
         return found
     ends = (place.joinpath(*parts[k:]) for k in range(len(parts)) for place in (*folders, Path()))

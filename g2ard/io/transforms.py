@@ -111,10 +111,13 @@ def files_of(folder: Path) -> dict[Path, str | None]:
 
 
 def _listed(path: Path, files: Mapping[Path, str | None], among: Path | None) -> Listed:
-    frames, left_out, notes = list[Frame](), list[tuple[str, InputError]](), list[Note]()
+    frames = list[Frame]()
+    left_out = list[tuple[str, InputError]]()
+    notes = list[Note]()
     for file, split in files.items():
         own, further = _frames(file, among, left_out, split)
-        frames, notes = frames + own, [*notes, *further]
+        frames = frames + own
+        notes = [*notes, *further]
     return Listed(path, frames, left_out, tuple(notes))
 
 
@@ -133,7 +136,8 @@ def _frames(
     }
     if not lists["frames"]:
         raise InputError("no views found ('frames' is empty)", path=path)
-    folder, above = path.parent, path.parent.parent
+    folder = path.parent
+    above = path.parent.parent
     names = [str(entry.get("file_path")) for entry in lists["frames"] if isinstance(entry, dict)]
     places = [folder, folder / "images", above / "resized_images"]
     finder = Finder(among) if among else Finder.among(names, places, [folder])
@@ -176,7 +180,8 @@ def _stated(path: Path, lists: dict[str, list[Any]]) -> dict[str, str]:
 
 
 def _frame(place: Place, shared: Json, entry: Any, finder: Finder, masks: Finder) -> Frame:
-    content, folder = {**shared, **checked(entry, Json, place)}, place.path.parent
+    content = {**shared, **checked(entry, Json, place)}
+    folder = place.path.parent
     if "rot_mat" in content:
         content |= _from_matrix_city(folder, checked(content, _Numbered, place))
     frame = checked(content, _Frame, place)
@@ -233,7 +238,8 @@ def _intrinsics(place: Place, frame: _Frame, photo: Path) -> Lens:
     lens = _pinhole(place, frame, (width, height))
     if model in _MODELS:
         return lens
-    K, k = lens.K, (frame.k1, frame.k2, frame.k3, frame.k4)
+    K = lens.K
+    k = (frame.k1, frame.k2, frame.k3, frame.k4)
     return Lens.of(PhotoLens(model, lens.size, (K[0, 0], K[1, 1], K[0, 2], K[1, 2], *k)))
 
 
@@ -249,7 +255,8 @@ def _pinhole(place: Place, frame: _Frame, size: Size) -> Lens:
             else frame.fl_y
         )
     else:  # beside fl_x, camera_angle_y may be of another camera
-        fx, fy = frame.fl_x, frame.fl_x if frame.fl_y is UNSET else frame.fl_y
+        fx = frame.fl_x
+        fy = frame.fl_x if frame.fl_y is UNSET else frame.fl_y
     fy = fy or fx
     if fx is None or fy is None:
         raise place.error("has no focal length (fl_x, camera_angle_x, or a 3×3 K or intrinsics)")

@@ -89,7 +89,8 @@ def _print(file: TextIO, splats: Splats, progress: Progress) -> None:
         '    uniform token sortingModeHint = "zDepth"\n'
     )
     arrays = _attributes(splats)
-    done, total = 0, sum(len(values) for _, values in arrays.values())
+    done = 0
+    total = sum(len(values) for _, values in arrays.values())
     for name, (kind, values) in arrays.items():
         row = ", ".join(["%.9g"] * values.shape[1])
         row = row if values.shape[1] == 1 else f"({row})"
@@ -204,7 +205,8 @@ def _nothing(path: Path, held: list[Any], fields: int) -> str:
 
 def _read_prim(pxr: Any, prim: Any) -> Noted:
     means = _values(pxr, prim, "positions", 3, None)
-    count, notes = len(means), []
+    count = len(means)
+    notes = []
     degree = _earliest(pxr, prim.GetAttribute(f"{_SH}Degree"))
     coefficients = any(_given(pxr, prim, f"{_SH}Coefficients{half}") is not None for half in ("", "h"))
     degree = int(degree) if degree is not None and coefficients else 0

@@ -48,7 +48,9 @@ class Tiling:
         """Number of cores that workers share."""
         if self.cores:
             return self.cores
-        return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        if hasattr(os, "sched_getaffinity"):
+            return len(os.sched_getaffinity(0))
+        return os.cpu_count() or 1
 
     @property
     def usable_memory(self) -> int:
@@ -58,14 +60,15 @@ class Tiling:
 
 def cut_into(folder: Path | None, rows: int) -> str:
     """Return what to type for tiles of this many rows: an option, or a command if a folder holds tiles."""
-    return (
-        f"--tile-rows {rows:,}" if folder is None else f"`g2ard ingest {folder} -o DIR --tile-rows {rows:,}`"
-    )
+    if folder is None:
+        return f"--tile-rows {rows:,}"
+    return f"`g2ard ingest {folder} -o DIR --tile-rows {rows:,}`"
 
 
 def is_tiled(source: Source, tiling: Tiling) -> bool:
     """Return whether a scene or point cloud is a folder of several tiles or is too large for one piece."""
-    most, files = tiling.most_rows, [source.file, *(other.file for other in source.others)]
+    most = tiling.most_rows
+    files = [source.file, *(other.file for other in source.others)]
     known = all(file.is_file() and file.suffix.lower() != ".json" for file in files)
     if known and sum(file.stat().st_size for file in files) < _LEAST_ROW_BYTES * most:
         return False

@@ -92,17 +92,17 @@ def save_levels(
         environment = environment.narrowed(levels[0].offset)
     tree = cut_tree(levels, rule, work)
     files = _Files(levels, rule.most, {}, Rounding(moved), error)
-    meta = _meta(levels, rule, _node(tree, files), list(files.parts), environment is not None)
+    meta = _write_meta(levels, rule, _describe_node(tree, files), list(files.parts), environment is not None)
     if work is not None:
         drop_temporaries(work)
         drop_temporaries(path.parent, path.name)
         files.write(work, path, progress)
-    with replaced(path, overwrite, _named_in(path)) as (folder, written):
+    with replaced(path, overwrite, _list_named(path)) as (folder, written):
         if work is None:
             files.write(folder, path, progress)
         else:
             for name in files.parts:  # linked, not moved: an interrupted call resumes from them
-                shutil.copytree((work / name).parent, (folder / name).parent, copy_function=_linked)
+                shutil.copytree((work / name).parent, (folder / name).parent, copy_function=_link)
         if environment is not None:
             _write_part(folder / _ENVIRONMENT_META, sog_files(path / _ENVIRONMENT_META, environment))
             files.rounding.add(largest_rounding(environment), environment)
@@ -114,7 +114,7 @@ def save_levels(
     return sum(written.values())
 
 
-def _meta(
+def _write_meta(
     levels: Sequence[Level], rule: Cut, root: dict[str, Any], names: list[str], has_environment: bool
 ) -> dict[str, Any]:
     counts = [len(level) for level in levels]
@@ -145,7 +145,7 @@ def _write_part(meta: Path, files: dict[str, bytes]) -> None:
             (begun / name).write_bytes(content)
 
 
-def _linked(source: str, target: str) -> None:
+def _link(source: str, target: str) -> None:
     """Hard-link a file, or copy it across file systems."""
     try:
         os.link(source, target)
@@ -197,30 +197,30 @@ class _Files:
         return splats.take(np.concatenate(order))
 
 
-def _node(tree: Node, files: _Files) -> dict[str, Any]:
+def _describe_node(tree: Node, files: _Files) -> dict[str, Any]:
     ends = np.array([tree.low, tree.high]) @ change_of_axes(files.levels[0].axes, "RDF").T
-    node: dict[str, Any] = {"bound": {"min": _rounded(ends.min(axis=0)), "max": _rounded(ends.max(axis=0))}}
+    node: dict[str, Any] = {"bound": {"min": _round(ends.min(axis=0)), "max": _round(ends.max(axis=0))}}
     if tree.children:
-        return {**node, "children": [_node(child, files) for child in tree.children]}
+        return {**node, "children": [_describe_node(child, files) for child in tree.children]}
     placed = {str(level): files.place(level, rows) for level, rows in enumerate(tree.rows) if len(rows)}
     return {**node, "lods": placed}
 
 
-def _rounded(values: Sequence[float] | NDArray[np.float64]) -> list[float]:
+def _round(values: Sequence[float] | NDArray[np.float64]) -> list[float]:
     """Round to seven digits, the precision of float32."""
     return [float(f"{float(value):.7g}") for value in values]
 
 
-def _named_in(path: Path) -> set[Path]:
+def _list_named(path: Path) -> set[Path]:
     """Return the relative paths of all level files that the folder's `lod-meta.json` names."""
     named: set[Path] = set()
     meta = read_object(path / "lod-meta.json")
-    for part in map(
-        Path, [*_names(meta, "filenames", _CHUNK_META), *_names(meta, "environment", _CHUNK_META)]
-    ):
-        entries = [entry for entry in read_object(path / part).values() if isinstance(entry, dict)]
-        images = [image for entry in entries for image in _names(entry, "files", _CHUNK_IMAGE)]
-        named |= {part, *map(part.with_name, images)}
+    parts = [*_filter_names(meta, "filenames", _CHUNK_META), *_filter_names(meta, "environment", _CHUNK_META)]
+    for part in map(Path, parts):
+        named.add(part)
+        for entry in read_object(path / part).values():
+            if isinstance(entry, dict):
+                named.update(map(part.with_name, _filter_names(entry, "files", _CHUNK_IMAGE)))
     return named
 
 
@@ -242,7 +242,7 @@ def replaced(path: Path, overwrite: bool, before: set[Path]) -> Iterator[tuple[P
     drop_empty(list({file.parent for file in stale}))
 
 
-def _names(content: dict[str, Any], key: str, pattern: re.Pattern[str]) -> list[str]:
+def _filter_names(content: dict[str, Any], key: str, pattern: re.Pattern[str]) -> list[str]:
     value = content.get(key)
     names = value if isinstance(value, list) else [value]
     return [name for name in map(str, names) if pattern.fullmatch(name)]

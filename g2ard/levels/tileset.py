@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from itertools import chain
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -153,10 +154,10 @@ def save_tileset(
     tiles = _Tiles(levels, rule.most, path, Rounding(moved), error)
     parts = tiles.of(tree, len(levels) - 1)
     size = float(np.linalg.norm(tree.high - tree.low))
-    root = parts[0] if len(parts) == 1 else _tile(tree, size, parts)
+    root = parts[0] if len(parts) == 1 else _describe_tile(tree, size, parts)
     matrix = np.eye(4) if place is None else place.matrix()
     turn = np.eye(4)
-    turn[:3, :3] = unit * _upright(axis) @ TILE_OF_SCENE.T
+    turn[:3, :3] = unit * _turn_upright(axis) @ TILE_OF_SCENE.T
     root["transform"] = (matrix @ turn).T.ravel().tolist()
     extensions = [EXTENSION, SPZ_EXTENSION]
     tileset = {
@@ -169,7 +170,7 @@ def save_tileset(
         "geometricError": unit * max(size, root["geometricError"]),
         "root": root,
     }
-    with replaced(path, overwrite, _named_in(path / "tileset.json")) as (folder, written):
+    with replaced(path, overwrite, _list_named(path / "tileset.json")) as (folder, written):
         for number, name in enumerate(tiles.files, start=1):
             (folder / name).write_bytes(b"".join(tiles.content(name)))
             progress("write", number, len(tiles.files))
@@ -189,7 +190,7 @@ def check_tiles(path: Path, splats: Splats, ratio: float, cut: Cut | None = None
     check_far(path, splats, means - middle, ratio**0.5, movable=True)
 
 
-def _upright(direction: ArrayLike) -> Float:
+def _turn_upright(direction: ArrayLike) -> Float:
     """Return the (3, 3) rotation of `up` to z, which keeps x in the plane of x and z."""
     axis = unit_up(direction)
     east = np.eye(3)[0 if abs(axis[0]) < 0.9 else 1]
@@ -215,14 +216,16 @@ class _Tiles:
         rows = [leaf.rows[level] for leaf in node.leaves()]
         count = sum(map(len, rows))
         if count > self.most and node.children:
-            return [tile for part in below for tile in self.of(part, level)]
-        finer = [tile for part in below for tile in self.of(part, level - 1)] if level else []
+            return list(chain.from_iterable(self.of(part, level) for part in below))
+        finer = list(chain.from_iterable(self.of(part, level - 1) for part in below)) if level else []
         if not count:
             return finer
-        error = max([self._error(level, rows), *(tile["geometricError"] for tile in finer)]) if finer else 0.0
+        error = 0.0
+        if finer:
+            error = max(self._error(level, rows), *(tile["geometricError"] for tile in finer))
         name = f"{level}_{len(self.files)}.glb"
         self.files[name] = level, rows, (node.low + node.high) / 2
-        return [_tile(node, error, finer) | {"content": {"uri": name}}]
+        return [_describe_tile(node, error, finer) | {"content": {"uri": name}}]
 
     def _error(self, level: int, rows: list[NDArray[np.int64]]) -> float:
         """Return 16 standard deviations of the median Gaussian, along its two longer axes."""
@@ -239,7 +242,7 @@ class _Tiles:
         return parts
 
 
-def _tile(node: Node, error: float, children: list[dict[str, Any]]) -> dict[str, Any]:
+def _describe_tile(node: Node, error: float, children: list[dict[str, Any]]) -> dict[str, Any]:
     middle = TILE_OF_SCENE @ (node.low + node.high) / 2
     half = np.abs(TILE_OF_SCENE @ (node.high - node.low)) / 2
     tile: dict[str, Any] = {
@@ -250,7 +253,7 @@ def _tile(node: Node, error: float, children: list[dict[str, Any]]) -> dict[str,
     return {**tile, "children": children} if children else tile
 
 
-def _named_in(file: Path) -> set[Path]:
+def _list_named(file: Path) -> set[Path]:
     """Return the names of the .glb files beside a tileset.json that it names."""
     tiles = [read_object(file).get("root", {})]
     names = set()

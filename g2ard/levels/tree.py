@@ -114,16 +114,16 @@ def cut(levels: Sequence[Level], rule: Cut | None = None, scratch: Path | None =
     check_levels(levels)
     tree = _Tree(levels, rule or Cut(), scratch)
     rows = tree.room(len(tree.means))
-    for at in _blocks(len(rows)):
+    for at in _split_rows(len(rows)):
         rows[at] = np.arange(at.start, at.stop)
     return tree.of(rows, ())
 
 
-def _blocks(count: int) -> Iterator[slice]:
+def _split_rows(count: int) -> Iterator[slice]:
     return (slice(start, min(start + _ROWS_AT_ONCE, count)) for start in range(0, count, _ROWS_AT_ONCE))
 
 
-def _reach(splats: Splats) -> Float:
+def _measure_reach(splats: Splats) -> Float:
     """Return the (N, 3) half extents of each Gaussian's 1σ box, |R|·s."""
     frames = rotation_matrices(splats.quats)
     return np.einsum("nij,nj->ni", np.abs(frames), splats.scales.astype(np.float64))
@@ -171,10 +171,10 @@ class _Tree:
         return Node(np.minimum(one.low, other.low), np.maximum(one.high, other.high), (one, other))
 
     def _box(self, rows: Rows) -> tuple[Float, Float]:
-        boxes = [
-            (part.min(axis=0), part.max(axis=0))
-            for part in (self.means[rows[at]] for at in _blocks(len(rows)))
-        ]
+        boxes = []
+        for at in _split_rows(len(rows)):
+            part = self.means[rows[at]]
+            boxes.append((part.min(axis=0), part.max(axis=0)))
         low, high = np.array(boxes, np.float64).swapaxes(0, 1)
         return low.min(axis=0), high.max(axis=0)
 
@@ -182,14 +182,14 @@ class _Tree:
         """Split rows at the median of `axis`; ties go by earlier cuts' axes, last first, then by row."""
         middle = len(rows) // 2
         values = np.empty(len(rows), self.means.dtype)
-        for at in _blocks(len(rows)):
+        for at in _split_rows(len(rows)):
             values[at] = self.means[rows[at], axis]
         values.partition(middle)
         limit = values[middle]
         short = middle - int(np.count_nonzero(values < limit))
         del values
         tied = np.concatenate(
-            [part[self.means[part, axis] == limit] for part in map(rows.__getitem__, _blocks(len(rows)))]
+            [part[self.means[part, axis] == limit] for part in map(rows.__getitem__, _split_rows(len(rows)))]
         )
         if axes:
             tied = tied[np.lexsort([self.means[tied, a] for a in axes])]
@@ -197,7 +197,7 @@ class _Tree:
         below = self.room(middle)
         above = self.room(len(rows) - middle)
         done = 0
-        for at in _blocks(len(rows)):
+        for at in _split_rows(len(rows)):
             part = rows[at]
             inside = (self.means[part, axis] < limit) | np.isin(part, lower, assume_unique=True)
             some = part[inside]
@@ -221,7 +221,7 @@ class _Tree:
             if a < b:
                 some = level.take(part)
                 means = some.means.astype(np.float64)
-                reach = _reach(some)
+                reach = _measure_reach(some)
                 low = np.minimum(low, (means - reach).min(axis=0))
                 high = np.maximum(high, (means + reach).max(axis=0))
         return Node(low, high, rows=tuple(parts))

@@ -372,12 +372,12 @@ def adapt(
         probe.fit_exposures()
     changed = None if change is None else {k: np.asarray(v).tolist() for k, v in vars(change).items()}
     taken = zip(config.stretches(len(targets.cameras)), scenes, strict=False)
-    stretches = tuple(Stretch(steps, probe.all_of(scene)) for steps, scene in taken)
+    stretches = tuple(Stretch(steps, probe.score(scene)) for steps, scene in taken)
     report = AdaptReport(
         steps=sum(stretch.steps for stretch in stretches),
         seconds=sum(fit.seconds for fit in fits),
         converged=fits[-1].psnr.after - fits[-1].psnr.before < config.tolerance,
-        psnr=Gain(probe.all_of(given), probe.all_of(result), probe.scored_in),
+        psnr=Gain(probe.score(given), probe.score(result), probe.scored_in),
         stretches=stretches,
         colour_change=changed,
         prior_share=float(1 - share.mean()),

@@ -56,7 +56,9 @@ class SelectConfig(Settings, tag="policy"):
         (3, 10)
         """
         wanted = 1.0 if self.views_count is None else self.views_count
-        return math.ceil(wanted * candidates - 1e-9) if isinstance(wanted, float) else wanted
+        if isinstance(wanted, float):
+            return math.ceil(wanted * candidates - 1e-9)
+        return wanted
 
 
 @dataclass(frozen=True)

@@ -35,7 +35,8 @@ class Steps:
     """
 
     def __init__(self, folder: Path | None, progress: Progress = silent) -> None:
-        self._folder, self._progress = folder, progress
+        self._folder = folder
+        self._progress = progress
         self.resumed: float | None = None
         self.filling = 0.0
 

@@ -118,7 +118,7 @@ class Matter:
             )
         weights = opacities * np.minimum(areas / middle(areas[areas > 0]), _WIDEST)
         votes = Votes.of(means, np.sqrt(areas), opacities, represents)
-        near = _near(means, opacities, votes)
+        near = _find_near(means, opacities, votes)
         some = np.flatnonzero(near)[:_SAMPLE]
         box = np.array([quantile(means[some, a], weights[some], [0.01, 0.99]) for a in range(3)])
         size = float(norms((box[:, 1] - box[:, 0])[None])[0]) / 2
@@ -162,7 +162,7 @@ class Matter:
         return np.take_along_axis(axes, self.order[rows][:, :, None], axis=1)
 
 
-def _near(means: Floats, weights: Floats, votes: Votes) -> NDArray[np.bool_]:
+def _find_near(means: Floats, weights: Floats, votes: Votes) -> NDArray[np.bool_]:
     """Return the rows that people look at from near: without a sky, surroundings and floaters.
 
     What lies beyond a gap is judged by votes. Of the rest, rows within `_FAR` typical distances of the centre
@@ -227,7 +227,9 @@ class Grid:
                 spans = turned(spans.reshape(-1, 3), axes).reshape(-1, 2, 3)
             offsets = _HALF_WIDTH * ((np.arange(count) + 0.5) / count * 2 - 1)
             for a, b in product(offsets, offsets):
-                index, inside = _index(points[rows] + a * spans[:, 0] + b * spans[:, 1], low, cell, shape)
+                index, inside = _index_cells(
+                    points[rows] + a * spans[:, 0] + b * spans[:, 1], low, cell, shape
+                )
                 share = optical[rows[inside]] / count**2
                 size = sizes[rows[inside]]
                 np.add.at(filled, index[inside], share)
@@ -235,7 +237,7 @@ class Grid:
         scale = np.zeros(len(filled), np.float32)
         some = filled > 0
         scale[some] = np.exp(logs[some] / filled[some])
-        opaque, murky = (_steps((filled > limit).reshape(shape)) for limit in (_OPAQUE, _MURKY))
+        opaque, murky = (_count_steps((filled > limit).reshape(shape)) for limit in (_OPAQUE, _MURKY))
         return cls(low, cell, opaque, murky, scale.reshape(shape))
 
     def distance(self, points: Floats) -> Floats:
@@ -243,7 +245,7 @@ class Grid:
 
         Distances within the box are at most `_REACH` − 1 cells.
         """
-        index, inside = _index(points, self.low, self.cell, np.array(self.murky.shape))
+        index, inside = _index_cells(points, self.low, self.cell, np.array(self.murky.shape))
         found = np.maximum(self.murky.ravel()[index].astype(np.float64) - 1, 0) * self.cell
         high = self.low + self.cell * np.array(self.murky.shape)
         outside = norms(np.maximum(0, np.maximum(self.low - points, points - high)))
@@ -251,7 +253,7 @@ class Grid:
 
     def scale_at(self, points: Floats) -> Floats:
         """Return (M,) values of `scale` in the cells of points, 0 outside the box."""
-        index, inside = _index(points, self.low, self.cell, np.array(self.murky.shape))
+        index, inside = _index_cells(points, self.low, self.cell, np.array(self.murky.shape))
         return np.where(inside, self.scale.ravel()[index], 0.0)
 
     def cast(self, eyes: Floats, directions: Floats, *, murky: bool = False) -> Floats:
@@ -267,7 +269,9 @@ class Grid:
         )
 
 
-def _index(points: Floats, low: Floats, cell: float, shape: NDArray[Any]) -> tuple[Any, NDArray[np.bool_]]:
+def _index_cells(
+    points: Floats, low: Floats, cell: float, shape: NDArray[Any]
+) -> tuple[Any, NDArray[np.bool_]]:
     """Return flat cell indices, clamped into the box, and whether each point was in it."""
     flat = np.zeros(len(points), np.int64)
     inside = np.ones(len(points), bool)
@@ -278,7 +282,7 @@ def _index(points: Floats, low: Floats, cell: float, shape: NDArray[Any]) -> tup
     return flat, inside
 
 
-def _steps(filled: NDArray[np.bool_]) -> NDArray[np.int8]:
+def _count_steps(filled: NDArray[np.bool_]) -> NDArray[np.int8]:
     """Return king's moves to the nearest filled cell, at most `_REACH`."""
     steps = np.full(filled.shape, _REACH, np.int8)
     steps -= filled

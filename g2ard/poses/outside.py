@@ -89,7 +89,7 @@ def plan_orbit(survey: Survey, count: int, shift: int = 0, first: int | None = N
         turn, rise, chance = halton(start, stop, 3, survey.seed + shift).T
         z = between(np.sin(np.radians(_ELEVATIONS)), rise)
         outward = directions(turn, np.sqrt(1 - z * z), z)
-        distances = _fitting(site, target, outward, lens) * between(_DISTANCES, chance)
+        distances = _fit_distances(site, target, outward, lens) * between(_DISTANCES, chance)
         distances = np.minimum(distances, _BELOW_SKY * site.horizon - norms((target - site.centre)[None]))
         poses = Poses(target + distances[:, None] * outward, -outward)
         free = site.is_free(poses.eyes, 2, _LOWEST)
@@ -99,7 +99,7 @@ def plan_orbit(survey: Survey, count: int, shift: int = 0, first: int | None = N
     return gather(survey, count if first is None else min(first, count), tried)
 
 
-def _fitting(site: Site, target: Floats, outward: Floats, lens: Lens) -> Floats:
+def _fit_distances(site: Site, target: Floats, outward: Floats, lens: Lens) -> Floats:
     """Return (P,) distances at which `_FITTING` of the matter is in frame, and all of it ahead."""
     points = site.points[:_OUTLINE] - target
     weights = site.weights[:_OUTLINE]
@@ -127,7 +127,7 @@ def ring(survey: Survey, rises: Sequence[float], turns: int) -> Poses:
         x, y, z = turned(points, frame).T
         eye = np.zeros(3)
         for _ in range(_ROUNDS):  # aim at the middle of what the frame shows, as near as it fits
-            away = _away(x - eye[0], y - eye[1], wide, tall, body) - z
+            away = _measure_away(x - eye[0], y - eye[1], wide, tall, body) - z
             eye[2] = -float(quantile(away, site.weights[:_OUTLINE], _WHOLE))
             ahead = np.flatnonzero(away <= -eye[2])
             for axis, across in ((0, x), (1, y)):
@@ -137,7 +137,7 @@ def ring(survey: Survey, rises: Sequence[float], turns: int) -> Poses:
     return Poses(eyes, gazes).take(site.is_free(eyes, 2, _LOWEST))
 
 
-def _away(x: Floats, y: Floats, wide: float, tall: float, body: float) -> Floats:
+def _measure_away(x: Floats, y: Floats, wide: float, tall: float, body: float) -> Floats:
     """Return the distances from which points (x, y) off the line of sight, and `body` around them, are in
     frame."""
     return np.maximum((np.abs(x) + body) / wide, (np.abs(y) + body) / tall) + body
@@ -154,7 +154,7 @@ def circle(survey: Survey, gazes: Floats) -> Poses:
     seen = [turned(points, frames[i]).T for i in evenly_spaced(len(gazes), _FITTED)]
     away = down = 0.0
     for _ in range(_ROUNDS):  # aim at the middle of what the frames show, as near as it fits all of them
-        needed = [_away(x, y - down, wide, tall, body) - z for x, y, z in seen]
+        needed = [_measure_away(x, y - down, wide, tall, body) - z for x, y, z in seen]
         away = max(float(quantile(one, weights, _WHOLE)) for one in needed)
         slopes = np.concatenate(
             [
@@ -175,7 +175,7 @@ def plan_aerial(survey: Survey, count: int, shift: int = 0, first: int | None = 
     """
     site = survey.site
     lens = survey.lens
-    height = _height(site, count, lens)
+    height = _choose_height(site, count, lens)
 
     def tried(start: int, stop: int) -> tuple[Poses, Floats]:
         x, y, kind, turn, pitch, chance = halton(start, stop, 6, survey.seed + shift).T
@@ -193,7 +193,7 @@ def plan_aerial(survey: Survey, count: int, shift: int = 0, first: int | None = 
     return gather(survey, count if first is None else min(first, count), tried)
 
 
-def _height(site: Site, count: int, lens: Lens) -> float:
+def _choose_height(site: Site, count: int, lens: Lens) -> float:
     """Return the height above the ground at which each spot lies in `_OVERLAP` nadir frames.
 
     It is at most the height from which one frame spans the scene, and always above what stands on the ground.

@@ -197,13 +197,13 @@ def plan_pool(
     survey = Survey(splats, represents, site, lens, seed, tell)
     if kind == "auto" and fov is None and is_room(survey):
         survey = replace(survey, lens=Lens(size, WIDE))
-    poses, used, why = _planned(survey, kind, count)
-    held = _held(survey, poses)
+    poses, used, why = _plan(survey, kind, count)
+    held = _measure_share_held(survey, poses)
     wanted = round(count * max(1.0, min(grow, 1 / np.sqrt(held))))
     if len(poses) == count and wanted > _WORTH * count:
         first = poses
         before = used
-        poses, used, why = _planned(survey, kind, wanted)
+        poses, used, why = _plan(survey, kind, wanted)
         if set(before) - set(used):  # more poses from above are lower, and may be judged otherwise
             rest = np.linspace(0, len(poses) - 1, wanted - count).round().astype(int)
             poses = Poses.joined([first, poses.take(rest)])
@@ -214,14 +214,14 @@ def plan_pool(
             f"request {'fewer, or ' if len(poses) else ''}another kind (`g2ard poses --kind`), "
             "or give views of the scene"
         )
-    poses, looks_beyond = _with_beyond(survey, poses)
+    poses, looks_beyond = _add_beyond(survey, poses)
     used += ["beyond"] if looks_beyond else []
     reach = reach_of(survey, poses)
-    more = partial(_more, survey, poses, reach)
+    more = partial(_plan_more, survey, poses, reach)
     need = max(float(np.interp(reach[2].mean(), _COARSE, (0, 1))), 1 - held)
     near_poses = plan_near(survey, poses, reach, int(near * need * len(poses)), 1)
     if len(near_poses):
-        poses = _replaced(poses, near_poses)
+        poses = _replace_some(poses, near_poses)
         used = [*used, "near"]
         reach = reach_of(survey, poses)
     spread = max(float(np.ptp(poses.eyes, axis=0).max()), np.finfo(float).tiny)
@@ -239,13 +239,13 @@ def plan_pool(
     )
 
 
-def _replaced(poses: Poses, others: Poses) -> Poses:
+def _replace_some(poses: Poses, others: Poses) -> Poses:
     """Return as many poses as before, of which `others` take the places of evenly spread ones."""
     kept = np.linspace(0, len(poses) - 1, len(poses) - len(others)).round().astype(int)
     return Poses.joined([poses.take(kept), others])
 
 
-def _with_beyond(survey: Survey, poses: Poses) -> tuple[Poses, bool]:
+def _add_beyond(survey: Survey, poses: Poses) -> tuple[Poses, bool]:
     """Let some poses look at a sky or surroundings that no frame holds; return whether any does."""
     if not len(survey.site.beyond):
         return poses, False
@@ -253,20 +253,20 @@ def _with_beyond(survey: Survey, poses: Poses) -> tuple[Poses, bool]:
     share = survey.site.beyond_share * float(missing.mean()) - _BEYOND[0]
     others = round(float(np.clip(share, 0, _BEYOND[1])) * len(poses))
     points = survey.site.beyond[missing]
-    return _replaced(poses, plan_beyond(survey, poses, points, others)), others > 0
+    return _replace_some(poses, plan_beyond(survey, poses, points, others)), others > 0
 
 
-def _planned(survey: Survey, kind: str, count: int) -> tuple[Poses, list[str], str]:
+def _plan(survey: Survey, kind: str, count: int) -> tuple[Poses, list[str], str]:
     """Return at most `count` poses of a kind, the kinds used, and the reasons."""
     if kind == "auto":
-        parts, why = _auto(survey, count)
+        parts, why = _plan_auto(survey, count)
     else:
         parts = {kind: _PLANNERS[kind](survey, count)}
         why = "as requested"
     return Poses.joined([*parts.values()]).take(slice(count)), [*parts], why
 
 
-def _more(survey: Survey, poses: Poses, reach: Reach, kind: str, count: int) -> list[Camera]:
+def _plan_more(survey: Survey, poses: Poses, reach: Reach, kind: str, count: int) -> list[Camera]:
     """Plan `Pool.more` views; near ones step from `poses`, with another seed than the pool's own."""
     survey.tell(0, 0)
     if kind == "near":
@@ -282,7 +282,7 @@ def _more(survey: Survey, poses: Poses, reach: Reach, kind: str, count: int) -> 
     return [replace(view, name=view.name.replace("pose", kind), kind=kind) for view in views]
 
 
-def _auto(survey: Survey, count: int) -> tuple[dict[str, Poses], str]:
+def _plan_auto(survey: Survey, count: int) -> tuple[dict[str, Poses], str]:
     """Plan poses for a scene of any kind; return them by kind, and the reasons.
 
     No decision covers the scene as a whole. Rooms are seen from within, in proportion to their size. The
@@ -311,13 +311,13 @@ def _auto(survey: Survey, count: int) -> tuple[dict[str, Poses], str]:
     if missing() and not hidden:
         kind = "aerial" if landscape else "orbit"
         why.append("a landscape" if landscape else "an object")
-        sharp = _sharp(survey, _PLANNERS[kind](survey, missing(), first=_SAMPLED))
+        sharp = _see_sharply(survey, _PLANNERS[kind](survey, missing(), first=_SAMPLED))
         share = float(sharp.mean()) if len(sharp) else 1.0
         far = _PLANNERS[kind](survey, missing(), first=None if share >= _FEW else 0)
         if share < _FEW:
             why.append(f"from around or above it looks blurred ({share:.0%} of the poses are sharp)")
         elif share < _MOST:
-            far = far.take(_sharp(survey, far))
+            far = far.take(_see_sharply(survey, far))
         if share >= _FEW and (landscape or is_room(survey)):
             add("walk", plan_walk(survey, round((_STREET if landscape else 1.0) * missing())))
         add(kind, far.take(slice(missing())))
@@ -331,7 +331,7 @@ def _auto(survey: Survey, count: int) -> tuple[dict[str, Poses], str]:
     return parts, "; ".join(why)
 
 
-def _sharp(survey: Survey, poses: Poses) -> NDArray[np.bool_]:
+def _see_sharply(survey: Survey, poses: Poses) -> NDArray[np.bool_]:
     """Return whether each pose sees the scene sharply; matter behind the scene does not count."""
     site = survey.site
     away = norms(poses.eyes - site.box.mean(axis=0))
@@ -341,7 +341,7 @@ def _sharp(survey: Survey, poses: Poses) -> NDArray[np.bool_]:
     return coarse < np.maximum(_SHARP, _SHARP_IN_SCALES * usual / np.maximum(away, np.finfo(float).tiny))
 
 
-def _held(survey: Survey, poses: Poses) -> float:
+def _measure_share_held(survey: Survey, poses: Poses) -> float:
     """Return the share of the scene's matter that a typical pose has in its frame."""
     if not len(poses):
         return 1.0

@@ -124,12 +124,12 @@ class Outlook:
         return cls(cameras, seen, sharp * np.maximum(covered, 1e-9) ** full, detail, spread)
 
 
-def _outside(survey: Survey, every: int = 1) -> Outlook:
+def _look_from_outside(survey: Survey, every: int = 1) -> Outlook:
     """Return views from around a scene, which show it whole; there are fewer if `every` is more than 1."""
     return Outlook.of(survey, survey.cameras(ring(survey, _RISES, _TURNS // every)))
 
 
-def _within(survey: Survey, every: int = 1) -> Outlook:
+def _look_from_within(survey: Survey, every: int = 1) -> Outlook:
     """Return views at eye level within a scene; there are fewer if `every` is more than 1."""
     wide = replace(survey, lens=Lens(survey.lens.size, WIDE))
     poses = Poses.joined([plan(wide, _STANDING // every) for plan in (plan_inside, plan_walk, plan_sharp)])
@@ -140,7 +140,9 @@ def _within(survey: Survey, every: int = 1) -> Outlook:
 def is_hidden(survey: Survey) -> bool:
     """Return whether views from around see little of what clear views within do, as above a ceiling, or show
     below a pixel what walls surround."""
-    return is_walled(survey) or (_is_roofed(survey) and _sees_less(_outside(survey, 2), _within(survey, 2)))
+    return is_walled(survey) or (
+        _is_roofed(survey) and _sees_less(_look_from_outside(survey, 2), _look_from_within(survey, 2))
+    )
 
 
 def _is_roofed(survey: Survey) -> bool:
@@ -177,14 +179,14 @@ def _sees_less(around: Outlook, within: Outlook) -> bool:
     return bool(seen.sum(dtype=np.float64) < _OPEN * np.maximum(seen, both).sum(dtype=np.float64))
 
 
-def _looks(survey: Survey) -> tuple[Outlook, str]:
+def _plan_looks(survey: Survey) -> tuple[Outlook, str]:
     """Return views that show a scene "within" it, planned only if it may be shown so, or from "around"."""
-    around = _outside(survey)
+    around = _look_from_outside(survey)
     room = is_room(survey)
     blurred = around.clear.sum() <= _CRISP * len(around.cameras)
     room = room or (not blurred and is_walled(survey))
     if room or blurred or _is_roofed(survey):
-        within = _within(survey)
+        within = _look_from_within(survey)
         good = within.clear.max(initial=0.0) > _GOOD
         if len(within.cameras) and (room or (good and (blurred or _sees_less(around, within)))):
             return within, "within"
@@ -216,7 +218,7 @@ def best_views(
     cameras = cameras and cameras.usual()
     if cameras is not None and len(cameras) == 1:
         return cameras
-    return _best(_survey(splats, size, axis), count, cameras)[0]
+    return _find_best(_create_survey(splats, size, axis), count, cameras)[0]
 
 
 def turntable(
@@ -234,8 +236,8 @@ def turntable(
 
     Args and Raises: as `best_views`.
     """
-    survey = _survey(splats, size, axis)
-    best, kind = _best(survey, 1, cameras and cameras.usual())
+    survey = _create_survey(splats, size, axis)
+    best, kind = _find_best(survey, 1, cameras and cameras.usual())
     site = survey.site
     first = best[0]
     angles = 2 * np.pi * np.arange(count) / count
@@ -250,7 +252,7 @@ def turntable(
             float(np.median((middle - first.position) @ best.forwards[0])) / site.size if len(middle) else 0.0
         )
         eyes = turned((cameras.positions - site.origin) / site.size, site.axes) - (eye + away * gaze)
-        angles = _within_arc(angles, np.arctan2(eyes[:, 1], eyes[:, 0]) - np.arctan2(-gaze[1], -gaze[0]))
+        angles = _turn_within_arc(angles, np.arctan2(eyes[:, 1], eyes[:, 0]) - np.arctan2(-gaze[1], -gaze[0]))
     gazes = around(gaze, angles)
     poses = circle(survey, gazes) if kind == "around" else Poses(eye + away * (gaze - gazes), gazes)
     half = max(first.width / first.K[0, 0], first.height / first.K[1, 1] * size[0] / size[1]) / 2
@@ -258,10 +260,10 @@ def turntable(
     return replace(views, names=tuple(f"{i:04d}" for i in range(count))), site.axes[2]
 
 
-def _within_arc(angles: Floats, seen: Floats) -> Floats:
+def _turn_within_arc(angles: Floats, seen: Floats) -> Floats:
     """Turn full circles into swings that begin at 0 and keep to the `seen` angles, if these leave a gap.
 
-    >>> _within_arc(np.radians([0, 90, 180, 270]), np.radians([0, 60, -30])).round(3).tolist()
+    >>> _turn_within_arc(np.radians([0, 90, 180, 270]), np.radians([0, 60, -30])).round(3).tolist()
     [0.0, 1.047, 0.0, -0.524]
     """
     order = np.sort(np.append(seen % (2 * np.pi), 0.0))
@@ -274,7 +276,7 @@ def _within_arc(angles: Floats, seen: Floats) -> Floats:
     return np.where(np.sin(angles) > 0, high, -low) * np.sin(angles)
 
 
-def _survey(splats: Splats, size: tuple[int, int], axis: ArrayLike | None) -> Survey:
+def _create_survey(splats: Splats, size: tuple[int, int], axis: ArrayLike | None) -> Survey:
     rows = np.flatnonzero(splats.opacities > 1 / 255)
     some = splats.take(rows[canonical_order(splats, rows, _ROWS)])
     represents = len(rows) / max(1, len(some))
@@ -282,20 +284,22 @@ def _survey(splats: Splats, size: tuple[int, int], axis: ArrayLike | None) -> Su
     return Survey(some, represents, Site.of(some, axis, None, represents), Lens(size))
 
 
-def _best(survey: Survey, count: int, cameras: Cameras | None) -> tuple[Cameras, str]:
+def _find_best(survey: Survey, count: int, cameras: Cameras | None) -> tuple[Cameras, str]:
     """Return the best views, and where they are: "photos", "within" or "around"."""
     if cameras is not None:
         look = Outlook.of(survey, cameras.take(evenly_spaced(len(cameras), _PHOTOS)))
-        return look.cameras.take(_chosen(look, look.detail * _wholeness(survey, look), count)), "photos"
-    look, kind = _looks(survey)
+        return look.cameras.take(
+            _choose(look, look.detail * _measure_wholeness(survey, look), count)
+        ), "photos"
+    look, kind = _plan_looks(survey)
     worth = look.detail if kind == "within" else look.detail * look.spread
-    found = look.cameras.take(_chosen(look, worth, count))
+    found = look.cameras.take(_choose(look, worth, count))
     if not len(found):
         raise InputError("no free place has a view of the scene; give views")
     return replace(found, names=tuple(f"view_{i:04d}" for i in range(len(found)))), kind
 
 
-def _wholeness(survey: Survey, look: Outlook) -> Floats:
+def _measure_wholeness(survey: Survey, look: Outlook) -> Floats:
     """Return (V,) how much photos show of their subject, which most have in the middle, and how whole."""
     outward = np.stack([camera.outward(survey.outlook.points) for camera in look.cameras])
     middle = (look.seen * np.exp(-np.square(outward / _MIDDLE) / 2)).mean(axis=0)
@@ -306,7 +310,7 @@ def _wholeness(survey: Survey, look: Outlook) -> Floats:
     return shown / max(float(shown.max()), 1e-30) * within**_UNCUT
 
 
-def _chosen(look: Outlook, worth: Floats, count: int) -> list[int]:
+def _choose(look: Outlook, worth: Floats, count: int) -> list[int]:
     """Return clear views in order of what they add, times their worth."""
     clear = look.clear + _LEAST
     worth = np.where(clear >= _CLEAR * clear.max(initial=0), worth * clear, 0.0)

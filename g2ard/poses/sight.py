@@ -200,7 +200,7 @@ class Glance:
             seen[i] = sums["transmittance"] / np.maximum(1, sums["hits"])
             detail[i] = sum(np.abs(np.diff(image, axis=axis)).mean(dtype=np.float64) for axis in (0, 1))
             shown = sums["weight"].astype(np.float64)
-            spread[i] = np.sqrt(sum(_variance(channel, shown) for channel in self._colors.T))
+            spread[i] = np.sqrt(sum(_measure_variance(channel, shown) for channel in self._colors.T))
         return covered, fine, detail, spread, seen
 
     def clear(self, cameras: Cameras, aims: NDArray[np.int64], close: float) -> Floats:
@@ -240,7 +240,7 @@ class Glance:
                 yield sums, norms(self._means - here.positions[i]), views[i - first]
 
 
-def _variance(values: Floats, weights: Floats) -> float:
+def _measure_variance(values: Floats, weights: Floats) -> float:
     total = max(float(weights.sum()), 1e-30)
     mean = float((weights * values).sum()) / total
     return float((weights * (values - mean) ** 2).sum()) / total

@@ -141,7 +141,7 @@ class Site:
         some = matter.first()
         axis = splats.up if axis is None else axis
         found = estimate_up(some) if axis is None else given_up(some, axis)
-        axes = _axes(some, found.axis)
+        axes = _choose_axes(some, found.axis)
         points = turned(some.points, axes)
         box = np.array([quantile(points[:, a], some.weights, _EXTENT) for a in range(3)]).T
         missing = np.maximum(0, _BODY * middle(matter.scales[:, 2]) - (box[1] - box[0]) / 2)
@@ -177,7 +177,9 @@ class Site:
 
     def above_ground(self, points: Floats) -> Floats:
         """Return (M,) heights above the ground, infinite without a ground."""
-        return points[:, 2] - self.ground(points) if self.terrain else np.full(len(points), np.inf)
+        if self.terrain:
+            return points[:, 2] - self.ground(points)
+        return np.full(len(points), np.inf)
 
     def is_free(self, points: Floats, cells: float, above: float = -np.inf) -> NDArray[np.bool_]:
         """Return whether points are over `cells` cells from matter, `above` the ground and below a sky."""
@@ -218,7 +220,7 @@ class Site:
         return Inside(places, share, weight)
 
 
-def _axes(some: Matter, axis: Floats) -> Floats:
+def _choose_axes(some: Matter, axis: Floats) -> Floats:
     """Return rows: along the scene if it is long, otherwise along a coordinate axis; to its left; up."""
     ahead = np.eye(3)[int(np.argmin(np.round(np.abs(axis), 3)))]
     ahead = ahead - (ahead @ axis) * axis
@@ -261,11 +263,11 @@ class Terrain:
             if k >= 0:
                 rows = order[first:end]
                 heights[k] = quantile(points[rows, 2], weights[rows], _LOW)
-        heights = _filled(heights.reshape(shape), box[0, 2])
-        lowest = _around(heights, np.inf).min(axis=0)
-        opened = _around(lowest, -np.inf).max(axis=0)  # without bumps narrower than three blocks
+        heights = _fill(heights.reshape(shape), box[0, 2])
+        lowest = _stack_neighbours(heights, np.inf).min(axis=0)
+        opened = _stack_neighbours(lowest, -np.inf).max(axis=0)  # without bumps narrower than three blocks
         padded = np.pad(opened, 1, mode="edge")
-        return cls(box[0, :2], block, _around(padded, 0.0).mean(axis=0)[1:-1, 1:-1])
+        return cls(box[0, :2], block, _stack_neighbours(padded, 0.0).mean(axis=0)[1:-1, 1:-1])
 
     def height(self, points: Floats) -> Floats:
         """Return (M,) ground heights under points: bilinear within the map, constant beyond its edge."""
@@ -280,19 +282,19 @@ class Terrain:
         return total
 
 
-def _filled(heights: Floats, default: float) -> Floats:
+def _fill(heights: Floats, default: float) -> Floats:
     """Fill gaps with the mean of their neighbours, ring by ring."""
     if np.isnan(heights).all():
         return np.full_like(heights, default)
     while (gaps := np.isnan(heights)).any():
-        around = _around(heights, np.nan)
+        around = _stack_neighbours(heights, np.nan)
         count = (~np.isnan(around)).sum(axis=0)
         heights = np.where(gaps & (count > 0), np.nansum(around, axis=0) / np.maximum(count, 1), heights)
     return heights
 
 
-def _around(heights: Floats, outside: float) -> Floats:
+def _stack_neighbours(heights: Floats, outside: float) -> Floats:
     """Return (9, X, Y), the neighbourhood of each cell, padded with `outside`."""
     wide = np.pad(heights, 1, constant_values=outside)
-    x, y = heights.shape
-    return np.stack([wide[a : a + x, b : b + y] for a in range(3) for b in range(3)])
+    windows = np.lib.stride_tricks.sliding_window_view(wide, heights.shape)
+    return windows.reshape(9, *heights.shape)

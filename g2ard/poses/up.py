@@ -60,7 +60,7 @@ def given_up(sample: Matter, direction: ArrayLike) -> Up:
         InputError: not three finite numbers, or all zero.
     """
     axis = unit_up(direction)
-    return Up(axis, _is_flat(sample)[0] or _layer(sample, axis)[0] > _GROUND_GIVEN, "up as given")
+    return Up(axis, _is_flat(sample)[0] or _find_layer(sample, axis)[0] > _GROUND_GIVEN, "up as given")
 
 
 def estimate_up(sample: Matter) -> Up:
@@ -72,26 +72,28 @@ def estimate_up(sample: Matter) -> Up:
     """
     flat, thin, long = _is_flat(sample)
     if flat:
-        return _signed(sample, _mean_normal(sample, thin, facing(sample, thin)), True, "the scene is flat")
+        return _choose_sign(
+            sample, _mean_normal(sample, thin, facing(sample, thin)), True, "the scene is flat"
+        )
     few = sample.first(_SEARCHED)
     directions = np.concatenate([np.eye(3), fibonacci(600)[:300]])
-    shares, _, edges = np.array([_layer(few, axis) for axis in directions]).T
-    axis = directions[int(np.argmax(edges * [_habit(axis) for axis in directions]))]
+    shares, _, edges = np.array([_find_layer(few, axis) for axis in directions]).T
+    axis = directions[int(np.argmax(edges * [_favour_habit(axis) for axis in directions]))]
     for _ in range(3):
-        inside = np.abs(along(sample.points, axis) - _layer(sample, axis)[1]) < 2 * _SLAB
+        inside = np.abs(along(sample.points, axis) - _find_layer(sample, axis)[1]) < 2 * _SLAB
         axis = _mean_normal(sample, axis, inside & facing(sample, axis, _FACING))
-    if _layer(sample, axis)[2] > _GROUND:
-        return _signed(sample, axis, True, "a ground plane")
+    if _find_layer(sample, axis)[2] > _GROUND:
+        return _choose_sign(sample, axis, True, "a ground plane")
     axis = directions[int(np.argmax(shares))]
     across = shares[np.abs(directions @ axis) < 0.5].max()
     axis = _mean_normal(sample, axis, facing(sample, axis, _FACING))
-    if shares.max() > _LAYERED * across and _habit(axis) > 1:
-        return _signed(sample, axis, True, "its layers face that way")
+    if shares.max() > _LAYERED * across and _favour_habit(axis) > 1:
+        return _choose_sign(sample, axis, True, "its layers face that way")
     if long is not None:
         usual = np.eye(3)[int(np.argmax(np.abs(long)))]  # long objects lean, files are upright
         axis = usual if abs(long @ usual) > np.cos(np.radians(15)) else long
-        return _signed(sample, axis, False, "no ground; the long axis")
-    return _signed(sample, np.array([0.0, -1.0, 0.0]), False, "no ground; a guess")
+        return _choose_sign(sample, axis, False, "no ground; the long axis")
+    return _choose_sign(sample, np.array([0.0, -1.0, 0.0]), False, "no ground; a guess")
 
 
 def facing(sample: Matter, axis: Floats, least: float = _SLOPED) -> NDArray[np.bool_]:
@@ -108,7 +110,7 @@ def _is_flat(sample: Matter) -> tuple[bool, Floats, Floats | None]:
     return bool(values[0] < _SHEET * values[1]), vectors[:, 0], long
 
 
-def _layer(sample: Matter, axis: Floats) -> tuple[float, float, float]:
+def _find_layer(sample: Matter, axis: Floats) -> tuple[float, float, float]:
     """Return the strongest layer that faces `axis`: its share of all matter, its height, and its edge.
 
     The edge is the share, reduced by matter on both sides: ground and walls have it on one side.
@@ -131,7 +133,7 @@ def _layer(sample: Matter, axis: Floats) -> tuple[float, float, float]:
     return float(share), float(height), float(edge)
 
 
-def _habit(axis: Floats) -> float:
+def _favour_habit(axis: Floats) -> float:
     """Return a factor that favours y and z, the up axes of nearly every file, over other directions."""
     return 1.2 if np.abs(axis[1:]).max() > np.cos(np.radians(15)) else 1.0
 
@@ -144,11 +146,13 @@ def _mean_normal(sample: Matter, axis: Floats, rows: NDArray[np.bool_]) -> Float
     return mean * np.copysign(1.0, mean @ axis)
 
 
-def _signed(sample: Matter, axis: Floats, grounded: bool, why: str) -> Up:
+def _choose_sign(sample: Matter, axis: Floats, grounded: bool, why: str) -> Up:
     """Turn the axis to where the matter is on its ground, or away from an object's heavier end."""
     heights = along(sample.points, axis)
     ends = quantile(heights, sample.weights, [0.01, 0.99])
-    lean = _lean(sample, axis, heights) if grounded else _lowness(heights, sample.weights, *ends)
+    lean = (
+        _measure_lean(sample, axis, heights) if grounded else _measure_lowness(heights, sample.weights, *ends)
+    )
     if abs(lean) > _UNSURE:
         side = "most of the scene lies above it" if grounded else "its heavier end is down"
         return Up(axis * np.copysign(1.0, lean), grounded, f"{why}, {side}")
@@ -157,13 +161,13 @@ def _signed(sample: Matter, axis: Floats, grounded: bool, why: str) -> Up:
     return Up(axis * sign, grounded, f"{why}, its sign by custom")
 
 
-def _lowness(heights: Floats, weights: Floats, low: float, high: float) -> float:
+def _measure_lowness(heights: Floats, weights: Floats, low: float, high: float) -> float:
     """Return how low the mean height lies from `high`, −1, to `low`, 1."""
     mean = (weights * heights).sum() / weights.sum()
     return float(1 - 2 * (mean - low) / max(high - low, np.finfo(float).tiny))
 
 
-def _lean(sample: Matter, axis: Floats, heights: Floats) -> float:
+def _measure_lean(sample: Matter, axis: Floats, heights: Floats) -> float:
     """Return how far the matter stands on the side of `axis`, from −1 to 1, relative to what faces it.
 
     Between a floor and a ceiling, the matter in between decides: furniture stands on floors. Otherwise
@@ -179,7 +183,9 @@ def _lean(sample: Matter, axis: Floats, heights: Floats) -> float:
         if high - low >= 6 * _SLAB and min(layers) > 0.25 * faces.sum():
             between = (heights > low + 2 * _SLAB) & (heights < high - 2 * _SLAB)
             empty = not weights[between].sum() > 0
-            return 0.0 if empty else _lowness(heights[between], weights[between], low, high)
+            if empty:
+                return 0.0
+            return _measure_lowness(heights[between], weights[between], low, high)
     first = np.cross(axis, np.eye(3)[int(np.argmin(np.abs(axis)))])
     first /= np.linalg.norm(first)
     sides = [np.floor(3 + 3 * along(sample.points, a)) for a in (first, np.cross(axis, first))]

@@ -152,7 +152,9 @@ class Votes:
     def horizon(self) -> float:
         """Distance from `centre` at which a sky begins; inf if none surrounds what is near."""
         beyond = self.distances[self.distances > self.radius]
-        return float(beyond.min()) if len(beyond) and self._closed(self.radius) > _CLOSED else np.inf
+        if len(beyond) and self._closed(self.radius) > _CLOSED:
+            return float(beyond.min())
+        return np.inf
 
     def _hidden(self, gaps: list[float], radius: float) -> float:
         """Return the largest share of the scene that a sky within a radius surrounds and hides."""

@@ -117,7 +117,7 @@ def is_room(survey: Survey) -> bool:
     return survey.inside.weight > _MOSTLY_INSIDE
 
 
-def _gazes(turn: Floats, rise: Floats) -> Floats:
+def _direct_gazes(turn: Floats, rise: Floats) -> Floats:
     return directions(turn, np.cos(rise), np.sin(rise))
 
 
@@ -134,7 +134,7 @@ def plan_inside(survey: Survey, count: int) -> Poses:
     def tried(start: int, stop: int) -> tuple[Poses, Floats]:
         at, turn, pitch = halton(start, stop, 3, survey.seed + 1).T
         reach = np.where(np.arange(start, stop) % 2 == 0, wide, len(places))
-        poses = Poses(places[(at * reach).astype(int)], _gazes(turn, between(_ROOM_PITCHES, pitch)))
+        poses = Poses(places[(at * reach).astype(int)], _direct_gazes(turn, between(_ROOM_PITCHES, pitch)))
         seen = Rays(survey, poses)
         return poses, np.minimum(seen.covered / _COVERED, seen.close / (_CLEAR_CELLS * site.grid.cell))
 
@@ -164,11 +164,11 @@ def plan_walk(survey: Survey, count: int, shift: int = 0, *, indoors: bool | Non
     else:
         places = places[closed(site, places, 32, 0.5, 1.0) < 1 - _SKY]
         places = places[closed(site, places, 16, -1.0, -0.8) > _FLOOR]
-    places = places[_together(site, places)]
+    places = places[_find_connected(site, places)]
 
     def tried(start: int, stop: int) -> tuple[Poses, Floats]:
         turn, pitch = halton(start, stop, 2, survey.seed + shift + 1).T
-        gazes = _gazes(turn, np.radians(between(_WALK_PITCHES, pitch)))
+        gazes = _direct_gazes(turn, np.radians(between(_WALK_PITCHES, pitch)))
         poses = Poses(places[np.arange(start, stop) % len(places)], gazes)
         seen = Rays(survey, poses)
         limits = [seen.covered / _FRAME[indoors], seen.close / (2 * room), seen.median / far]
@@ -182,7 +182,7 @@ def closed(site: Site, points: Floats, rays: int, low: float, high: float) -> Fl
     return np.isfinite(site.met(points, fibonacci(rays, low, high))).mean(axis=1)
 
 
-def _together(site: Site, points: Floats) -> NDArray[np.bool_]:
+def _find_connected(site: Site, points: Floats) -> NDArray[np.bool_]:
     """Return whether each point belongs to a large part of the graph that joins neighbours in sight."""
     count = len(points)
     apart = sum((column[:, None] - column) ** 2 for column in points.T)
@@ -207,7 +207,7 @@ def plan_sharp(survey: Survey, count: int, also: Poses | None = None) -> Poses:
         *at, turn, pitch = halton(2 * start, 2 * stop, 5, survey.seed + 2).T
         points = between(site.box, np.stack(at, axis=1))
         free = site.is_free(points, 3)
-        poses = Poses(points[free], _gazes(turn, np.radians(between(_SHARP_PITCHES, pitch)))[free])
+        poses = Poses(points[free], _direct_gazes(turn, np.radians(between(_SHARP_PITCHES, pitch)))[free])
         poses = poses.take(Rays(survey, poses).close > 4 * site.grid.cell)
         if also is not None and not start:
             poses = Poses.joined([also, poses])
@@ -232,7 +232,7 @@ def plan_anywhere(survey: Survey, count: int) -> Poses:
     def tried(start: int, stop: int) -> tuple[Poses, Floats]:
         which, far, turn, rise = halton(start, stop, 4, survey.seed + 5).T
         aims = rows[(which * len(rows)).astype(int)]
-        gazes = -_gazes(turn, np.radians(between(_RISES, rise)))
+        gazes = -_direct_gazes(turn, np.radians(between(_RISES, rise)))
         distances = diagonal * _DISTANCES[0] * (_DISTANCES[1] / _DISTANCES[0]) ** far
         poses = Poses(points[aims] - distances[:, None] * gazes, gazes)
         free = site.grid.cast(poses.eyes, gazes) > distances - 2 * site.grid.cell

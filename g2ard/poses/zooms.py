@@ -56,11 +56,11 @@ def zoomed(scene: Splats, cameras: Cameras, *, represents: float = 1.0, share: f
     views = list(cameras)
     for i in free[:wanted]:
         which, *at = chances[i]
-        views[i] = _window(views[i], points[small[i][int(which * len(small[i]))]], np.array(at))
+        views[i] = _place_window(views[i], points[small[i][int(which * len(small[i]))]], np.array(at))
     return Cameras.of(views)
 
 
-def _window(view: Camera, point: Floats, at: Floats) -> Camera:
+def _place_window(view: Camera, point: Floats, at: Floats) -> Camera:
     """Return the window of a view that has a point at this share of its width and height, within the view."""
     size = np.array([view.width, view.height], np.float64)
     x, y, z = view.K @ (view.viewmat[:3, :3] @ point + view.viewmat[:3, 3])

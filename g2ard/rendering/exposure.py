@@ -91,16 +91,20 @@ class Moments:
         return float((self.total - 2 * (change * self.right).sum(1) + squares).sum())
 
 
-def _beyond(alpha: NDArray[np.float32] | None, background: Background) -> NDArray[np.float32] | float:
+def _find_backdrop(alpha: NDArray[np.float32] | None, background: Background) -> NDArray[np.float32] | float:
     """Return what of an image is background behind a photo with alpha."""
-    return 0.0 if alpha is None else (1 - alpha[..., None]) * np.asarray(background, np.float32)
+    if alpha is None:
+        return 0.0
+    return (1 - alpha[..., None]) * np.asarray(background, np.float32)
 
 
-def _moments(image: NDArray[np.float32], targets: Targets, view: int, background: Background) -> Moments:
+def _compare_moments(
+    image: NDArray[np.float32], targets: Targets, view: int, background: Background
+) -> Moments:
     """Compare a render, not clipped, with a photo where neither too bright nor too dark to tell."""
     photo = targets[view]
     alpha = alpha_of(targets, view)
-    beyond = _beyond(alpha, background)
+    beyond = _find_backdrop(alpha, background)
     mask = mask_of(targets, view)
     counts = ((photo > _BLACK) & (photo < _SATURATED)).astype(np.float64)
     if mask is not None:
@@ -125,9 +129,9 @@ def rendered(renderer: Renderer, targets: Targets, view: int) -> NDArray[np.floa
         return renderer.clipped(targets.cameras[view])
     image = renderer.image(targets.cameras[view])
     background = renderer.background
-    gain, offset = _moments(image, targets, view, background).fit().T.astype(np.float32)
+    gain, offset = _compare_moments(image, targets, view, background).fit().T.astype(np.float32)
     alpha = alpha_of(targets, view)
-    beyond = _beyond(alpha, background)
+    beyond = _find_backdrop(alpha, background)
     cover = np.float32(1) if alpha is None else alpha[..., None]
     return np.clip((image - beyond) * gain + offset * cover + beyond, 0, 1)
 
@@ -143,7 +147,7 @@ def unexposed(
     mask = mask_of(targets, view)
     alpha = alpha_of(targets, view)
     gain, offset = exposure.T.astype(np.float32)
-    beyond = _beyond(alpha, background)
+    beyond = _find_backdrop(alpha, background)
     cover = np.float32(1) if alpha is None else alpha[..., None]
     lost = ((photo >= _SATURATED) & (gain > 1)).any(2)
     if alpha is not None:
@@ -174,34 +178,34 @@ def exposures_of(
     renderer = Renderer(splats.with_sh_degree(0), background=background)
 
     def moments(view: int) -> Moments:
-        return _moments(renderer.image(targets.cameras[view]), targets, view, background)
+        return _compare_moments(renderer.image(targets.cameras[view]), targets, view, background)
 
     if not decided:
         some = [photos[i] for i in evenly_spaced(len(photos), _COMPARED_VIEWS)]
         compared = list(in_threads(moments, some))
         fits = np.array([each.fit() for each in compared])
-        common = _common(fits)
+        common = _find_common(fits)
         before = sum(each.error(common) for each in compared)
         after = sum(each.error(fit) for each, fit in zip(compared, fits, strict=True))
-        grey = _relative(fits, list(range(len(fits))), len(fits)) @ [0.5, 1.0]
+        grey = _relate(fits, list(range(len(fits))), len(fits)) @ [0.5, 1.0]
         stops = np.log2(np.maximum(grey, 1e-3) / 0.5)
         if after >= (1 - _EXPLAINED_SHARE) * before or np.sqrt((stops**2).mean()) < _LEAST_STOPS:
             return None
         if len(some) == len(photos):
-            return _relative(fits, photos, len(targets.cameras))
+            return _relate(fits, photos, len(targets.cameras))
     fits = np.array([each.fit() for each in in_threads(moments, photos)])
-    return _relative(fits, photos, len(targets.cameras))
+    return _relate(fits, photos, len(targets.cameras))
 
 
-def _common(fits: Float) -> Float:
+def _find_common(fits: Float) -> Float:
     """Return the (3, 2) exposure that all have in common."""
     gain = np.exp(np.log(fits[..., 0]).mean(0))
     return np.stack([gain, gain * fits[..., 1].mean(0) / fits[..., 0].mean(0)], 1)
 
 
-def _relative(fits: Float, rows: list[int], count: int) -> Float:
+def _relate(fits: Float, rows: list[int], count: int) -> Float:
     """Return the exposures of all views relative to what those of photos have in common."""
-    gain, offset = _common(fits).T
+    gain, offset = _find_common(fits).T
     made = np.tile([1.0, 0.0], (count, 3, 1))
     made[rows, :, 0] = fits[..., 0] / gain
     made[rows, :, 1] = fits[..., 1] - made[rows, :, 0] * offset

@@ -30,7 +30,7 @@ def psnr(image: _Image, target: _Image, mask: NDArray[np.bool_] | None = None) -
     if mask is not None:
         image = image[mask][:, None]
         target = target[mask][:, None]
-    return float(np.minimum(100.0, _core.psnr(_float32(image), _float32(target))))
+    return float(np.minimum(100.0, _core.psnr(_as_float32(image), _as_float32(target))))
 
 
 def edge_psnr(image: _Image, target: _Image, mask: NDArray[np.bool_] | None = None) -> float:
@@ -46,7 +46,7 @@ def edge_psnr(image: _Image, target: _Image, mask: NDArray[np.bool_] | None = No
     >>> edge_psnr(flat, shifted), round(edge_psnr(flat, line), 2)
     (100.0, 18.75)
     """
-    count, error, *_ = _core.steps(_float32(image), _float32(target), _counts(mask))
+    count, error, *_ = _core.steps(_as_float32(image), _as_float32(target), _counts(mask))
     if error == 0 or not count:
         return 100.0
     return float(np.minimum(100.0, -10 * np.log10(error / count)))
@@ -68,7 +68,7 @@ def detail(image: _Image, target: _Image, mask: NDArray[np.bool_] | None = None)
     >>> detail(flat, flat + 0.1)
     1.0
     """
-    count, _, own, wanted, common = _core.steps(_float32(image), _float32(target), _counts(mask))
+    count, _, own, wanted, common = _core.steps(_as_float32(image), _as_float32(target), _counts(mask))
     least = max(1, count) * _INVISIBLE**2
     return float((common + least) / np.sqrt((own + least) * (wanted + least)))
 
@@ -91,7 +91,7 @@ def lost_detail(image: _Image, target: _Image, mask: NDArray[np.bool_] | None = 
     >>> lost_detail(stripes, stripes), lost_detail(stripes, flat), lost_detail(flat, stripes) > 1
     (0.0, 0.0, True)
     """
-    wanted, common = _core.contrasts(_float32(image), _float32(target), _counts(mask)).T
+    wanted, common = _core.contrasts(_as_float32(image), _as_float32(target), _counts(mask)).T
     contrast = np.sqrt(wanted)
     visible = contrast > _SEEN_CONTRAST
     if not visible.any():
@@ -124,10 +124,10 @@ def ssim(image: _Image, target: _Image, mask: NDArray[np.bool_] | None = None) -
     >>> round(ssim(np.eye(16)[:, :, None], np.eye(16)[:, :, None]), 6)
     1.0
     """
-    return _core.ssim(_float32(image), _float32(target), _counts(mask))
+    return _core.ssim(_as_float32(image), _as_float32(target), _counts(mask))
 
 
-def _float32(image: _Image) -> NDArray[np.float32]:
+def _as_float32(image: _Image) -> NDArray[np.float32]:
     return np.ascontiguousarray(image, dtype=np.float32)
 
 
@@ -203,9 +203,10 @@ class Lpips:
         self.net = net
         self.scaled = scaled
         try:
-            self._layers = {
-                i: [backbone[f"features.{i}.{name}"] for name in ("weight", "bias")] for i in _CONV[net]
-            }
+            self._layers = {}
+            for i in _CONV[net]:
+                layer = f"features.{i}"
+                self._layers[i] = [backbone[f"{layer}.weight"], backbone[f"{layer}.bias"]]
             self._linear = [linear[f"lin{i}.model.1.weight"].reshape(1, -1, 1, 1) for i in range(5)]
         except KeyError as error:
             raise InputError(f"LPIPS {net}: the weights lack {error}") from None
@@ -217,7 +218,7 @@ class Lpips:
         with torch.inference_mode():
             total = 0.0
             for a, b, weight in zip(self._maps(image), self._maps(target), self._linear, strict=True):
-                difference = (_unit(a) - _unit(b)) ** 2
+                difference = (_normalize(a) - _normalize(b)) ** 2
                 total += float((difference * weight).sum(1).mean())
         return total
 
@@ -275,6 +276,6 @@ def load_lpips(folder: Path, *, scaled: bool = True) -> dict[str, Lpips]:
     return out
 
 
-def _unit(x: Any) -> Any:
+def _normalize(x: Any) -> Any:
     """Normalise each pixel's feature vector to unit length."""
     return x / (x.pow(2).sum(1, keepdim=True).sqrt() + 1e-10)

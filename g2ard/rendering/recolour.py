@@ -46,7 +46,7 @@ def recoloured(dense: Splats, small: Splats, views: Cameras, progress: Progress 
     arrays = arrays_of(dense)
 
     def shown(view: int) -> tuple[_Image, _Image]:
-        image, alpha, *_ = _drawn(_core.Rasterizer(), arrays, view_of(cameras, view, settings), settings)
+        image, alpha, *_ = _draw(_core.Rasterizer(), arrays, view_of(cameras, view, settings), settings)
         return image, alpha
 
     return shifted(small, chosen, shown, settings, progress)
@@ -77,7 +77,7 @@ def shifted(
     def sums(view: int) -> NDArray[np.float64]:
         image, alpha = shown(view)
         rasterizer, camera = _core.Rasterizer(), view_of(cameras, view, settings)
-        own_image, opacity, *_ = _drawn(rasterizer, arrays, camera, settings)
+        own_image, opacity, *_ = _draw(rasterizer, arrays, camera, settings)
         alpha = alpha[..., None]
         own_alpha = opacity[..., None]
         error = own_alpha * image - alpha * own_image
@@ -93,5 +93,5 @@ def shifted(
     return replace(small, sh0=(small.sh0 + shift / SH_C0).astype(np.float32))
 
 
-def _drawn(rasterizer: _core.Rasterizer, arrays: Any, camera: View, settings: RasterSettings) -> Any:
+def _draw(rasterizer: _core.Rasterizer, arrays: Any, camera: View, settings: RasterSettings) -> Any:
     return rasterizer.forward(arrays, camera, settings, list(_DARKNESS))

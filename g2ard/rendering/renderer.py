@@ -378,13 +378,13 @@ def panorama(
         for number, picture in enumerate(pictures):
             here = np.flatnonzero(face == number)
             x, y, z = local[number, here].T
-            fine[here] = _sampled(picture, side, half * x / z + side / 2, half * y / z + side / 2)
+            fine[here] = _sample(picture, side, half * x / z + side / 2, half * y / z + side / 2)
         fine_rows = fine.reshape(rows.stop - rows.start, _FINER * width, 5)
         out[top:bottom] = resize(fine_rows, (width, bottom - top))
     return np.ascontiguousarray(out[..., :3]), out[..., 3].copy(), out[..., 4].copy()
 
 
-def _sampled(
+def _sample(
     picture: _Floats, side: int, u: NDArray[np.float64], v: NDArray[np.float64]
 ) -> NDArray[np.float32]:
     """Sample a square picture, (side², C), bilinearly at pixels u, v."""

@@ -93,16 +93,16 @@ def scored_in(targets: Targets, split: str = "") -> str:
 
 def fingerprint_of(targets: Targets) -> str:
     """Return hashes of the views, their kinds and the source of their images, for checkpoints."""
-    return f"{_source(targets)} {targets.cameras.fingerprint()}"
+    return f"{_identify_source(targets)} {targets.cameras.fingerprint()}"
 
 
-def _source(targets: Targets) -> str:
+def _identify_source(targets: Targets) -> str:
     """Return the identity of the images' sources, or a hash of the images if their class is the user's."""
     own = type(targets).__module__.startswith("g2ard.")
-    return str(targets.source) if own else _content(targets)  # type: ignore[attr-defined]
+    return str(targets.source) if own else _hash_content(targets)  # type: ignore[attr-defined]
 
 
-def _content(targets: Targets) -> str:
+def _hash_content(targets: Targets) -> str:
     views = range(len(targets.cameras))
     return key_of([key_of([np.asarray(targets[view]), mask_of(targets, view)]) for view in views])
 
@@ -209,7 +209,7 @@ class _Chosen(_Sourced):
         parts = [targets for targets, _ in self._parts()]
         numbers = {id(targets): number for number, targets in enumerate(parts)}
         places = [(numbers[id(targets)], row) for targets, row in self._places]
-        return [_source(targets) for targets in parts], places
+        return [_identify_source(targets) for targets in parts], places
 
     def _parts(self, views: Sequence[int] | None = None) -> list[tuple[Targets, list[int]]]:
         """Return the other targets and the rows in them of some views, of all by default."""
@@ -265,7 +265,7 @@ class _Converted(_Chosen):
 
     def _given(self) -> Sequence[Any]:
         """Return a hash of the converted images."""
-        return [_content(self)]
+        return [_hash_content(self)]
 
     def __getitem__(self, view: int) -> NDArray[np.float32]:
         try:
@@ -398,7 +398,7 @@ class Photos(Cached):
         self._masks: dict[int, NDArray[np.bool_] | None] = {}
         self._alphas: dict[int, NDArray[np.float32] | None] = {}
         self._undo = {
-            view: _inverse_exposure(name, exposures[name])
+            view: _invert_exposure(name, exposures[name])
             for view, name in enumerate(cameras.names)
             if exposures and name in exposures
         }
@@ -429,7 +429,7 @@ class Photos(Cached):
 
     def _make(self, view: int) -> NDArray[np.uint8 | np.float32]:
         if self._images is not None:
-            return _over(self._images[view], self._background)
+            return _composite(self._images[view], self._background)
         image, mask = load_photo(self.cameras, view, self._background)
         self._cached(self._masks, view, lambda _: mask)
         return np.rint(image * 255).astype(np.uint8)
@@ -446,7 +446,7 @@ class Photos(Cached):
         return photo
 
 
-def _over(image: NDArray[Any], background: Colour) -> NDArray[np.uint8 | np.float32]:
+def _composite(image: NDArray[Any], background: Colour) -> NDArray[np.uint8 | np.float32]:
     """Composite an image with alpha over the background."""
     if image.shape[2] == 3:
         return image
@@ -576,7 +576,7 @@ class PhotosOrRenders(_Chosen):
         super().__init__(cameras, places)
 
 
-def _inverse_exposure(name: str, exposure: NDArray[np.float64]) -> NDArray[np.float32]:
+def _invert_exposure(name: str, exposure: NDArray[np.float64]) -> NDArray[np.float32]:
     """Return the (3, 4) transform from the photo `name` to a render, from its exposure (render to photo)."""
     matrix = np.asarray(exposure, np.float64)
     if matrix.shape != (3, 4) or not np.isfinite(matrix).all() or abs(np.linalg.det(matrix[:, :3])) < 1e-6:

@@ -216,5 +216,8 @@ def spread(count: int) -> list[int]:
     >>> spread(6)
     [0, 3, 1, 4, 2, 5]
     """
+    order = [0] * count
     half = (count + 1) // 2
-    return [i for pair in zip(range(half), range(half, half + half), strict=True) for i in pair if i < count]
+    order[::2] = range(half)
+    order[1::2] = range(half, count)
+    return order

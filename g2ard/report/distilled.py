@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import zip_longest
+from itertools import chain, zip_longest
 from pathlib import Path
 from statistics import fmean
 from types import MappingProxyType
@@ -59,7 +59,9 @@ class Drawn:
         self.best = best
         self.parts = parts
         self._shown = set(map(_identify, best.cameras))
-        self._scored = {_identify(view): view.kind for part in parts for view in part.cameras}
+        self._scored: dict[_Key, str] = {}
+        for part in parts:
+            self._scored |= {_identify(view): view.kind for view in part.cameras}
         self._worst: dict[str, list[tuple[float, _Key]]] = {kind: [] for kind in self._scored.values()}
         self._kept: dict[_Key, dict[str, tuple[NDArray[np.uint8], float]]] = {}
 
@@ -162,12 +164,14 @@ def write_distill_report(
     page = Page(title, summarize_run(report))
     if files:
         page.links(files, f"{report.sizes}: ")
-    views = [(part, row) for part in drawn.parts for row in range(len(part.cameras))]
-    parts = [part for part in (report.scores, report.apart) if part]
-    scores = {name: [view for part in parts for view in part[name].views] for name in report.scores}
-    before = scores["simplified"]
-    after = scores["recovered"]
-    scores[RESULT] = after
+    views: list[tuple[Targets, int]] = []
+    for part in drawn.parts:
+        views += [(part, row) for row in range(len(part.cameras))]
+    before = list(report.scores["simplified"].views)
+    after = list(report.scores["recovered"].views)
+    if report.apart:
+        before += report.apart["simplified"].views
+        after += report.apart["recovered"].views
 
     def show(view: Pictures) -> None:
         named = zip(renderers, view.images, view.psnrs, strict=True)
@@ -194,7 +198,9 @@ def write_distill_report(
     lost = _find_worsened(before, after)
     if lost:
         page.paragraph(f"Views that ended below their start: {', '.join(text for _, text in lost)}.")
-    shown = list(dict.fromkeys([*(row for row, _ in lost[:1]), *_choose_worst(after)]))[:_SHOWN]
+    shown = _choose_worst(after)
+    if lost and lost[0][0] not in shown:
+        shown = [lost[0][0], *shown][:_SHOWN]
     shown.sort(key=lambda row: after[row].psnr)
     worst = [view for view in shown if after[view].name != best.name]
     if worst:
@@ -232,7 +238,9 @@ def describe_edges(kinds: Sequence[KindScore]) -> str | None:
         for kind in kinds
         if (change := kind.change("edge_psnr"))
     ]
-    return f"Edges, wires and text (PSNR of gradients): {', '.join(found)}." if found else None
+    if found:
+        return f"Edges, wires and text (PSNR of gradients): {', '.join(found)}."
+    return None
 
 
 def summarize_run(report: RunReport) -> str:
@@ -273,10 +281,12 @@ def _find_worsened(before: Sequence[ViewScore], after: Sequence[ViewScore]) -> l
     >>> _find_worsened(rows, [ViewScore(31.0, name="a"), ViewScore(29.0, name="b")])
     [(1, 'b 30.00 → 29.00 dB')]
     """
-    falls = [old.psnr - new.psnr for old, new in zip(before, after, strict=True)]
-    rows = sorted((row for row, fall in enumerate(falls) if fall > LOST), key=lambda row: -falls[row])
-    texts = [f"{after[i].name} {before[i].psnr:.2f} → {after[i].psnr:.2f} dB" for i in rows]
-    return list(zip(rows, texts, strict=True))
+    found = []
+    for row, (old, new) in enumerate(zip(before, after, strict=True)):
+        fall = old.psnr - new.psnr
+        if fall > LOST:
+            found.append((-fall, row, f"{new.name} {old.psnr:.2f} → {new.psnr:.2f} dB"))
+    return [(row, text) for _, row, text in sorted(found)]
 
 
 def _choose_worst(scores: Sequence[ViewScore]) -> list[int]:
@@ -284,7 +294,8 @@ def _choose_worst(scores: Sequence[ViewScore]) -> list[int]:
     found = rows_by_kind([view.kind for view in scores])
     kinds = [sorted(rows, key=lambda row: scores[row].psnr) for rows in found.values()]
     kinds.sort(key=lambda rows: fmean(scores[row].psnr for row in rows))
-    return [row for turn in zip_longest(*kinds) for row in turn if row is not None][:_SHOWN]
+    turns = chain.from_iterable(zip_longest(*kinds))
+    return [row for row in turns if row is not None][:_SHOWN]
 
 
 def write_preview(path: Path, drawn: Sequence[Pictures], scenes: Sequence[tuple[str, Splats]]) -> None:
@@ -292,15 +303,14 @@ def write_preview(path: Path, drawn: Sequence[Pictures], scenes: Sequence[tuple[
 
     Small images are enlarged, so that the picture is at least 1,200 pixels wide.
     """
-    times = max(1, math.ceil(_PICTURE / sum(image.shape[1] for image in (drawn[0].target, *drawn[0].images))))
-    rows = [
-        [image.repeat(times, 0).repeat(times, 1) for image in (view.target, *view.images)] for view in drawn
-    ]
+    rows = [[view.target, *view.images] for view in drawn]
+    times = max(1, math.ceil(_PICTURE / sum(image.shape[1] for image in rows[0])))
     names = [name for name, _ in scenes]
-    captions = [
-        ", ".join([view.name, *(f"{n} {p:.2f} dB" for n, p in zip(names, view.psnrs, strict=True))])
-        for view in drawn
-    ]
+    captions = []
+    for row, view in enumerate(drawn):
+        rows[row] = [image.repeat(times, 0).repeat(times, 1) for image in rows[row]]
+        psnrs = [f"{name} {psnr:.2f} dB" for name, psnr in zip(names, view.psnrs, strict=True)]
+        captions.append(", ".join([view.name, *psnrs]))
     labels = [TARGET, *label_scenes(names, [len(splats) for _, splats in scenes])]
     write_png(path, draw_contact_sheet(rows, labels, row_labels=captions), overwrite=True)
 

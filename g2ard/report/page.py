@@ -65,10 +65,12 @@ def find_worst_windows(image: NDArray[np.uint8], target: NDArray[np.uint8]) -> l
     )
     found: list[Window] = []
     while len(found) < _CROPS and sums.max() >= 0:
-        top, left = (int(k) for k in np.unravel_index(int(np.argmax(sums)), sums.shape))
+        top, left = divmod(int(np.argmax(sums)), sums.shape[1])
         found.append((left / width, top / height, columns / width, rows / height))
         # No later window may overlap this one.
-        sums[max(0, top - rows + 1) : top + rows, max(0, left - columns + 1) : left + columns] = -1
+        above = max(0, top - rows + 1)
+        before = max(0, left - columns + 1)
+        sums[above : top + rows, before : left + columns] = -1
     return found
 
 
@@ -115,10 +117,10 @@ class Page:
         body = []
         mark = ' class="best"'
         for i, row in enumerate(rows):
-            cells = "".join(
-                f'<td data-column="{escape(name)}"{mark * ((i, j) in best)}>{escape(cell)}</td>'
-                for j, (name, cell) in enumerate(zip(columns, row, strict=True))
-            )
+            cells = ""
+            for j, (name, cell) in enumerate(zip(columns, row, strict=True)):
+                bold = mark if (i, j) in best else ""
+                cells += f'<td data-column="{escape(name)}"{bold}>{escape(cell)}</td>'
             body.append(f"<tr>{cells}</tr>")
         self._parts.append(
             f'<div class="scroll"><table><thead><tr>{head}</tr></thead>'
@@ -149,16 +151,15 @@ class Page:
             f'<option value="{n}">{escape(s.name)} {escape(s.caption)}</option>'
             for n, s in zip(numbers, shown, strict=True)
         )
-        marks = "".join(
-            f'<i class="roi r{k % 2}" style="left:{left:.2%};top:{top:.2%};width:{across:.2%};'
-            f'height:{down:.2%}"></i>'
-            for k, (left, top, across, down) in enumerate(windows)
-        )
         named = [Shown(name, target), *shown]
-        crops = [
-            f'<div class="crops r{k % 2}">{"".join(self._crop(one, w) for one in named)}</div>'
-            for k, w in enumerate(windows)
-        ]
+        marks = ""
+        crops = ""
+        for k, window in enumerate(windows):
+            left, top, across, down = window
+            place = f"left:{left:.2%};top:{top:.2%};width:{across:.2%};height:{down:.2%}"
+            marks += f'<i class="roi r{k % 2}" style="{place}"></i>'
+            parts = "".join(self._crop(one, window) for one in named)
+            crops += f'<div class="crops r{k % 2}">{parts}</div>'
         self._parts.append(
             f'<section class="view"><h4>{escape(title)}</h4>'
             f'<div class="pair" style="width:calc(85vh*{width / height:.4f})">'
@@ -167,7 +168,7 @@ class Page:
             f'{marks}<span class="tag left">{name}</span><span class="tag right"></span>'
             f'<input type="range" min="0" max="100" value="50" aria-label="{name} or rendering"></div>'
             f'<label class="pick">right: <select>{options}</select></label></div>'
-            f'<div class="parts">{"".join(crops)}</div></section>'
+            f'<div class="parts">{crops}</div></section>'
         )
 
     def _crop(self, shown: Shown, window: Window) -> str:

@@ -51,14 +51,14 @@ def write_registration_report(
     page.paragraph(told)
     columns = ["photo", "status", "ZNCC", "σ position", "σ rotation, °", "why"]
     table = [columns, *map(_list_cells, found.report.photos)]
-    names, *cells = zip(*(column for column in zip(*table, strict=True) if any(column[1:])), strict=True)
+    told_of = [column for column in zip(*table, strict=True) if any(column[1:])]
+    names, *cells = zip(*told_of, strict=True)
     page.table(names, cells)
     page.heading("Least alike first")
-    rows = found.report.photos
-    seen = [i for i, row in enumerate(rows) if row.camera_from_world is not None]
+    seen = [(i, row) for i, row in enumerate(found.report.photos) if row.camera_from_world is not None]
+    seen.sort(key=lambda one: -1.0 if one[1].zncc is None else one[1].zncc)
     renderer = Renderer(scene, background=background)
-    for i in sorted(seen, key=lambda i: -1.0 if (zncc := rows[i].zncc) is None else zncc)[:_VIEWS]:
-        row = rows[i]
+    for i, row in seen[:_VIEWS]:
         one = cameras.take([i]).resized(_SIZE)
         try:
             photo = to_bytes(load_photo(one, 0, background)[0])
@@ -68,7 +68,8 @@ def write_registration_report(
         alike = "kept at its start" if row.zncc is None else f"ZNCC {row.zncc:.2f}"
         shown = [Shown("render", render, alike)]
         if row.name in starts:
-            shown.append(Shown("start", to_bytes(renderer.image(replace(one[0], viewmat=starts[row.name])))))
+            start = renderer.image(replace(one[0], viewmat=starts[row.name]))
+            shown.append(Shown("start", to_bytes(start)))
         page.comparison(f"{row.name}: {row.status}", photo, shown, "photo")
         matches = found.matches.get(row.name)
         if matches is not None:

@@ -278,7 +278,9 @@ class RunReport(Report):
         """Number of photos, points or Gaussians that the result was made from."""
         if self.photos:
             return plural(self.photos, "photo")
-        return plural(self.input_count, "point") if self.lifted else f"{self.input_count:,}"
+        if self.lifted:
+            return plural(self.input_count, "point")
+        return f"{self.input_count:,}"
 
     @property
     def made(self) -> str:

@@ -20,15 +20,18 @@ def draw_contact_sheet(
 
     Rows may be short, and have captions below.
     """
-    grid = [
-        [Image.fromarray(np.ascontiguousarray(to_bytes(image))).convert("RGB") for image in row]
-        for row in rows
-    ]
-    if not any(grid):
+    grid: list[list[Image.Image]] = []
+    heights: list[int] = []
+    widths = [0] * max(map(len, rows), default=0)
+    for images in rows:
+        cells = [Image.fromarray(np.ascontiguousarray(to_bytes(image))).convert("RGB") for image in images]
+        grid.append(cells)
+        heights.append(max((cell.height for cell in cells), default=0))
+        for c, one in enumerate(cells):
+            widths[c] = max(widths[c], one.width)
+    columns = len(widths)
+    if not columns:
         raise InputError("a contact sheet needs images")
-    columns = max(map(len, grid))
-    widths = [max(row[c].width for row in grid if c < len(row)) for c in range(columns)]
-    heights = [max((cell.height for cell in row), default=0) for row in grid]
     text = max(11, min(28, max(widths) // 20))
     font = ImageFont.load_default(text)
     line = round(1.6 * text)

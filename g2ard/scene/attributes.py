@@ -1,6 +1,7 @@
 """Attributes of Gaussians by name, as columns of a table."""
 
 from collections.abc import Callable
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -22,7 +23,7 @@ _DERIVED: dict[tuple[str, ...], Callable[[Splats], NDArray[Any]]] = {
     ("elongation",): lambda splats: elongation(splats.scales)[:, None],
 }
 
-ATTRIBUTES = tuple(name for names in (*_TABLE, *_DERIVED) for name in names)
+ATTRIBUTES = tuple(chain(*_TABLE, *_DERIVED))
 """Names of attributes that conditions can use."""
 
 
@@ -36,12 +37,9 @@ def columns(splats: Splats) -> dict[str, NDArray[Any]]:
     >>> list(columns(Splats.create([[1, 2, 3]], scales=[[1, 1, 1]])))[:5]
     ['x', 'y', 'z', 'opacity', 'scale_x']
     """
-    found = {
-        name: values[:, at]
-        for names, of in _TABLE.items()
-        for values in [of(splats)]
-        for at, name in enumerate(names)
-    }
+    found: dict[str, NDArray[Any]] = {}
+    for names, read in _TABLE.items():
+        found |= zip(names, read(splats).T, strict=True)
     for k in range(splats.shN.shape[1]):
         for channel, color in enumerate(("red", "green", "blue")):
             found[f"{color}_{k + 1}"] = splats.shN[:, k, channel]

@@ -302,9 +302,11 @@ class Cameras(Shown):
         """Return the views that `index` selects (a mask or indices), in its order."""
         index = np.asarray(index)
         rows = np.flatnonzero(index) if index.dtype == bool else index.astype(int).reshape(-1)
-        arrays: dict[str, Any] = {name: getattr(self, name)[rows] for name in _ARRAY_SHAPES}
-        tuples: dict[str, Any] = {name: tuple(getattr(self, name)[i] for i in rows) for name in _TUPLE_FIELDS}
-        return replace(self, **arrays, **tuples)
+        fields: dict[str, Any] = {name: getattr(self, name)[rows] for name in _ARRAY_SHAPES}
+        for name in _TUPLE_FIELDS:
+            values = getattr(self, name)
+            fields[name] = tuple(values[row] for row in rows)
+        return replace(self, **fields)
 
     def usual(self) -> Cameras:
         """Return the views of the usual kind; all views if there are no others."""
@@ -362,7 +364,9 @@ class Cameras(Shown):
         if len(sizes) == 1:
             return "×".join(map(str, next(iter(sizes)))) + " px"
         sides = sorted({max(size) for size in sizes})
-        return f"{sides[0]}–{sides[-1]} px" if len(sides) > 1 else "".join(f"{side} px" for side in sides)
+        if len(sides) > 1:
+            return f"{sides[0]}–{sides[-1]} px"
+        return "".join(f"{side} px" for side in sides)
 
     def cropped(self, low: ArrayLike, high: ArrayLike) -> Cameras:
         """Return the parts of the views from pixel `low` up to `high`, each (C, 2) or (2,), x before y.
@@ -446,7 +450,9 @@ def rows_by_kind(kinds: Sequence[str]) -> dict[str, list[int]]:
     >>> rows_by_kind(["near", "usual", "near"])
     {'usual': [1], 'near': [0, 2]}
     """
-    rows = {kind: [i for i, own in enumerate(kinds) if own == kind] for kind in (USUAL, *kinds)}
+    rows: dict[str, list[int]] = {USUAL: []}
+    for row, kind in enumerate(kinds):
+        rows.setdefault(kind, []).append(row)
     return {kind: members for kind, members in rows.items() if members}
 
 

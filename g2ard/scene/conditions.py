@@ -47,7 +47,7 @@ def holds(
     """
     try:
         with np.errstate(all="ignore"):
-            found = _value(_tree(condition), dict.fromkeys(names, column))
+            found = _evaluate(_parse(condition), dict.fromkeys(names, column))
         if not _is_condition(found):
             raise _invalid(f"{condition!r} is a number; compare it with another")
     except RecursionError as error:
@@ -63,7 +63,7 @@ def names_in(condition: str) -> set[str]:
     >>> sorted(names_in("abs(x) < 2 and classification == 2"))
     ['classification', 'x']
     """
-    return {node.id for node in ast.walk(_tree(condition)) if isinstance(node, ast.Name)} - {*_FUNCTIONS}
+    return {node.id for node in ast.walk(_parse(condition)) if isinstance(node, ast.Name)} - {*_FUNCTIONS}
 
 
 def check_condition(condition: str) -> None:
@@ -89,7 +89,7 @@ _FUNCTIONS: dict[str, Callable[[list[Any]], Any]] = {
 }
 
 
-def _tree(text: str) -> ast.expr:
+def _parse(text: str) -> ast.expr:
     if len(text) > _LONGEST:
         raise _invalid(f"expected at most {_LONGEST} characters, got {len(text)}")
     try:
@@ -99,20 +99,20 @@ def _tree(text: str) -> ast.expr:
         raise _invalid(f"{text!r} is not a condition, such as {examples}") from error
 
 
-def _value(node: ast.expr, columns: _Columns) -> Any:
+def _evaluate(node: ast.expr, columns: _Columns) -> Any:
     """Return the value of an expression: numbers or booleans, one or one per row."""
     match node:
         case ast.BoolOp(op, operands):
             join = np.logical_and if isinstance(op, ast.And) else np.logical_or
-            return reduce(join, [_condition(one, columns) for one in operands])
+            return reduce(join, [_evaluate_condition(one, columns) for one in operands])
         case ast.UnaryOp(ast.Not(), operand):
-            return np.logical_not(_condition(operand, columns))
+            return np.logical_not(_evaluate_condition(operand, columns))
         case ast.UnaryOp(op, operand) if type(op) in _SIGNS:
-            return _SIGNS[type(op)](_number(operand, columns))
+            return _SIGNS[type(op)](_evaluate_number(operand, columns))
         case ast.BinOp(left, op, right) if type(op) in _ARITHMETIC:
-            return _ARITHMETIC[type(op)](_number(left, columns), _number(right, columns))
+            return _ARITHMETIC[type(op)](_evaluate_number(left, columns), _evaluate_number(right, columns))
         case ast.Compare(left, ops, others) if all(type(op) in _COMPARISONS for op in ops):
-            values = [_number(one, columns) for one in (left, *others)]
+            values = [_evaluate_number(one, columns) for one in (left, *others)]
             steps = zip(ops, values, values[1:], strict=False)
             return reduce(np.logical_and, [_COMPARISONS[type(op)](a, b) for op, a, b in steps])
         case ast.Call(ast.Name(name), arguments, []) if name in _FUNCTIONS:
@@ -120,7 +120,7 @@ def _value(node: ast.expr, columns: _Columns) -> Any:
                 raise _invalid(
                     f"{name} takes {'one number' if name in ('abs', 'sqrt') else 'several numbers'}"
                 )
-            return _FUNCTIONS[name]([_number(one, columns) for one in arguments])
+            return _FUNCTIONS[name]([_evaluate_number(one, columns) for one in arguments])
         case ast.Constant(bool()):
             pass
         case ast.Constant(int() | float() as value) if abs(value) < 1e300:
@@ -136,15 +136,15 @@ def _is_condition(value: Any) -> bool:
     return bool(np.asarray(value).dtype == bool)
 
 
-def _condition(node: ast.expr, columns: _Columns) -> Any:
-    value = _value(node, columns)
+def _evaluate_condition(node: ast.expr, columns: _Columns) -> Any:
+    value = _evaluate(node, columns)
     if not _is_condition(value):
         raise _invalid(f"{ast.unparse(node)!r} is a number; and, or and not take comparisons")
     return value
 
 
-def _number(node: ast.expr, columns: _Columns) -> Any:
-    value = _value(node, columns)
+def _evaluate_number(node: ast.expr, columns: _Columns) -> Any:
+    value = _evaluate(node, columns)
     if _is_condition(value):
         raise _invalid(f"{ast.unparse(node)!r} is a comparison where a number is expected")
     return value

@@ -115,7 +115,7 @@ def cut_tree(points: Points, rows_each: float, most: int) -> KdTree:
     spans = np.ptp(points, axis=0)
     for axis in sorted(range(3), key=lambda a: (-(high[a] - low[a]), -spans[a], a)):
         values = np.sort(points[:, axis])
-        at = _between(values, len(values) * (parts // 2) / parts)
+        at = _find_between(values, len(values) * (parts // 2) / parts)
         if at is not None:
             inside = points[:, axis] < at
             below, above = (cut_tree(points[side], rows_each, most) for side in (inside, ~inside))
@@ -132,7 +132,7 @@ def parts_of(points: int, rows_each: float, most: int) -> int:
     return parts
 
 
-def _between(values: Points, rank: float) -> np.float32 | None:
+def _find_between(values: Points, rank: float) -> np.float32 | None:
     """Return the value, other than the minimum, whose rank is nearest to `rank`."""
     middle = values[min(int(rank), len(values) - 1)]
     first = int(np.searchsorted(values, middle, "left"))
@@ -172,7 +172,7 @@ class Sampler:
 
     def add(self, points: Points) -> None:
         """Sample from (N, 3) float32 points, skipping points that are not finite."""
-        hashes = _hashes(points)
+        hashes = _hash(points)
         chosen = np.isfinite(points).all(1)
         if self.limit < 1 << 32:
             chosen &= hashes < np.uint32(self.limit)
@@ -194,7 +194,7 @@ class Sampler:
         return points, (1 << 32) / self.limit
 
 
-def _hashes(points: Points) -> NDArray[np.uint32]:
+def _hash(points: Points) -> NDArray[np.uint32]:
     """Hash each row's bits to (N,) uint32, finished like MurmurHash3."""
     bits = np.ascontiguousarray(points).view(np.uint32)
     h = bits[:, 0] * np.uint32(0x9E3779B1)

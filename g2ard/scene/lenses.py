@@ -90,7 +90,7 @@ class PhotoLens:
             u = (np.arctan2(x, z) / (2 * np.pi) + 0.5) * width
             v = (np.arctan2(y, np.hypot(x, z)) / np.pi + 0.5) * height
             return np.stack([u, v], 1), np.ones(len(u), bool)
-        inside = angle < _end(self)
+        inside = angle < _find_end(self)
         angle = np.where(inside, angle, 0.0)
         away = self._plane_radius(angle)
         aim = np.where(across > 0, across, 1.0)
@@ -144,7 +144,7 @@ class PhotoLens:
         focal = scale * float(np.sqrt(self.focal[0] * self.focal[1]))
         if self.model != "EQUIRECTANGULAR":
             cx, cy, _ = self._centre_and_rest
-            angles = np.linspace(0, _end(self), 20001)[:-1]
+            angles = np.linspace(0, _find_end(self), 20001)[:-1]
             radii = np.hypot(*self._bent(self._plane_radius(angles), np.zeros(len(angles))))
             ends = np.array([cx, self.size[0] - cx, cy, self.size[1] - cy]) / np.repeat(self.focal, 2)
             left, right, top, bottom = np.interp(ends, radii, angles)
@@ -161,7 +161,7 @@ class PhotoLens:
 
 
 @lru_cache(maxsize=64)
-def _end(lens: PhotoLens) -> float:
+def _find_end(lens: PhotoLens) -> float:
     """Return the angle from the axis where a lens ends: its radius stops growing, or the corners of a
     photo that shows the whole image circle begin."""
     planar = lens.model in ("FULL_OPENCV", "FOV")

@@ -46,7 +46,7 @@ class PreparedScene(Splats):
     @property
     def _arrays(self) -> Splats:
         """A scene of the same arrays, for `core`: a reference to this one would be a cycle."""
-        return Splats(**_values(self))
+        return Splats(**_list_values(self))
 
 
 def as_prepared(splats: Splats) -> PreparedScene:
@@ -56,17 +56,17 @@ def as_prepared(splats: Splats) -> PreparedScene:
     """
     if isinstance(splats, PreparedScene):
         return splats
-    return PreparedScene(**_values(splats) | {"quats": unit_quats(splats.quats)})
+    return PreparedScene(**_list_values(splats) | {"quats": unit_quats(splats.quats)})
 
 
-def _values(splats: Splats) -> dict[str, Any]:
+def _list_values(splats: Splats) -> dict[str, Any]:
     return {f.name: getattr(splats, f.name) for f in fields(splats)}
 
 
 def finite_rows_of(splats: Splats) -> tuple[PreparedScene, NDArray[np.bool_] | slice]:
     """Return the finite rows of a scene, prepared, and their mask."""
     arrays = (splats.means, splats.quats, splats.scales, splats.sh0, splats.shN)
-    everything = all(_all_finite(a) for a in arrays) and not np.isnan(splats.logit_opacities).any()
+    everything = all(_are_finite(a) for a in arrays) and not np.isnan(splats.logit_opacities).any()
     finite = np.ones(len(splats), bool) if everything else splats.finite_rows()
     if not finite.any():
         raise InputError(f"none of the {len(splats)} rows is finite", parameter="splats")
@@ -84,7 +84,7 @@ def finite_rows_of(splats: Splats) -> tuple[PreparedScene, NDArray[np.bool_] | s
         sh0=np.ascontiguousarray(scene.sh0, np.float32),
         shN=np.ascontiguousarray(scene.shN, np.float32),
     )
-    scene = scene.with_sh_degree(_used_degree(scene))
+    scene = scene.with_sh_degree(_find_used_degree(scene))
     return as_prepared(scene), slice(None) if everything else finite
 
 
@@ -99,13 +99,13 @@ def with_some_opacity(scene: PreparedScene) -> PreparedScene:
     )
 
 
-def _all_finite(values: NDArray[Any]) -> bool:
+def _are_finite(values: NDArray[Any]) -> bool:
     """Return whether all values are finite; tests the sum first, which is faster."""
     with np.errstate(over="ignore", invalid="ignore"):
         return bool(np.isfinite(values.sum()) or np.isfinite(values).all())
 
 
-def _used_degree(scene: Splats) -> int:
+def _find_used_degree(scene: Splats) -> int:
     """Return the highest SH degree with a nonzero coefficient."""
     degree = scene.sh_degree
     while degree > 0:

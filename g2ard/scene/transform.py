@@ -101,7 +101,8 @@ def deformed(splats: Splats, matrix: NDArray[np.float64]) -> tuple[Splats, bool]
     fitted to the colours that c(M⁻¹·d) has, and the base colour stays.
     """
     linear = matrix[:3, :3]
-    if not np.isfinite(matrix).all() or abs(det := float(np.linalg.det(linear))) < np.finfo(float).tiny:
+    det = float(np.linalg.det(linear))
+    if not np.isfinite(matrix).all() or abs(det) < np.finfo(float).tiny:
         raise InputError("flattens the scene, or is not finite", parameter="transform")
     turn = linear / np.cbrt(det)
     exact = bool(np.allclose(turn @ turn.T, np.eye(3), atol=1e-4))
@@ -116,30 +117,30 @@ def deformed(splats: Splats, matrix: NDArray[np.float64]) -> tuple[Splats, bool]
     if exact:
         shN = rotate_harmonics(splats.shN, np.sign(det) * turn)
     else:
-        shN = _warped(splats.shN, linear)
+        shN = _warp(splats.shN, linear)
     return replace(
         moved,
         means=(splats.means.astype(np.float64) @ linear.T).astype(splats.means.dtype),
-        quats=_quaternions(frames),
+        quats=_to_quaternions(frames),
         scales=scales.astype(np.float32),
         shN=shN,
     ), exact
 
 
-def _warped(shN: NDArray[np.float32], linear: NDArray[np.float64]) -> NDArray[np.float32]:
+def _warp(shN: NDArray[np.float32], linear: NDArray[np.float64]) -> NDArray[np.float32]:
     """Fit coefficients of bands 1 to 3 to c'(d) = c(M⁻¹·d) over many directions."""
     directions = np.random.default_rng(0).normal(size=(512, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     before = directions @ np.linalg.inv(linear).T
     before /= np.linalg.norm(before, axis=1, keepdims=True)
     rest = shN.shape[1]
-    here = _basis(directions)[:, :rest]
-    there = _basis(before)[:, :rest]
+    here = _evaluate_basis(directions)[:, :rest]
+    there = _evaluate_basis(before)[:, :rest]
     turn = np.linalg.lstsq(here, there, rcond=None)[0]
     return np.einsum("kj,njc->nkc", turn, shN.astype(np.float64)).astype(np.float32)
 
 
-def _quaternions(rotations: NDArray[np.float64]) -> NDArray[np.float32]:
+def _to_quaternions(rotations: NDArray[np.float64]) -> NDArray[np.float32]:
     """Return (N, 4) wxyz of (N, 3, 3) rotations, by the largest of the four components."""
     r = rotations
     trace = r[:, 0, 0] + r[:, 1, 1] + r[:, 2, 2]
@@ -225,8 +226,8 @@ def rotate_harmonics(shN: NDArray[np.float32], rotation: NDArray[np.float64]) ->
     out = np.empty_like(shN)
     directions = np.random.default_rng(0).normal(size=(64, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    here = _basis(directions)
-    there = _basis(directions @ rotation)
+    here = _evaluate_basis(directions)
+    there = _evaluate_basis(directions @ rotation)
     for band in range(1, 4):
         rows = slice(band * band - 1, (band + 1) ** 2 - 1)
         if rows.stop > shN.shape[1]:
@@ -246,7 +247,7 @@ def harmonic_signs(axes: Iterable[float]) -> NDArray[np.float32]:
     return np.array([math.prod(signs[axis] for axis in odd) for odd in _ODD], np.float32)
 
 
-def _basis(d: NDArray[np.float64]) -> NDArray[np.float64]:
+def _evaluate_basis(d: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the (N, 15) real harmonics of bands 1 to 3 at unit vectors."""
     x, y, z = d.T
     xx = x * x
@@ -316,7 +317,9 @@ def as_stored(splats: Splats) -> Splats:
     [[1.0, -3.0, 2.0]]
     """
     near = splats.narrowed()
-    return near if near.axes == "RDF" else with_axes(near, change_of_axes(near.axes, "RDF"))
+    if near.axes == "RDF":
+        return near
+    return with_axes(near, change_of_axes(near.axes, "RDF"))
 
 
 class HasAxes(Protocol):

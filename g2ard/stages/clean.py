@@ -101,12 +101,12 @@ def find_clutter(
     for name, rows in (("seen", seen.weight), ("unoccluded", unoccluded)):
         require(name, len(rows), len(rows) == len(splats), f"{len(splats)} rows")
     kind = np.full(len(splats), -1, np.int8)
-    hidden = _invisible(splats, seen, unoccluded, pixels)
+    hidden = _mark_invisible(splats, seen, unoccluded, pixels)
     finders = {
         "invisible": lambda rest: hidden,
-        "giant": lambda rest: _giants(splats, *(extent or extent_of(splats))),
-        "needle": lambda rest: _needles(splats, rest, progress),
-        "floater": lambda rest: _floaters(splats, rest, seen.weight, unoccluded, progress),
+        "giant": lambda rest: _mark_giants(splats, *(extent or extent_of(splats))),
+        "needle": lambda rest: _mark_needles(splats, rest, progress),
+        "floater": lambda rest: _mark_floaters(splats, rest, seen.weight, unoccluded, progress),
     }
     if floating is not None:
         finders["haze"] = lambda rest: floating[0] > 1 - strength
@@ -121,7 +121,9 @@ def find_clutter(
     return Cleaning(kind)
 
 
-def _invisible(splats: Splats, seen: Any, unoccluded: NDArray[np.bool_], pixels: int) -> NDArray[np.bool_]:
+def _mark_invisible(
+    splats: Splats, seen: Any, unoccluded: NDArray[np.bool_], pixels: int
+) -> NDArray[np.bool_]:
     """Mark Gaussians that no renderer draws, and the weakest ones that change no pixel by half an 8-bit step.
 
     The latter are taken in order of light until together they would change the mean pixel by half a step.
@@ -157,7 +159,7 @@ def compare_depths(
     points = splats.means.astype(np.float64)
     owners = np.arange(len(splats))
     if floating:
-        long, mean_to_end = _elongated(splats, owners)
+        long, mean_to_end = _find_elongated(splats, owners)
         points = np.concatenate([points, points[long] - mean_to_end, points[long] + mean_to_end])
         owners = np.concatenate([owners, long, long])
     points += splats.offset
@@ -168,7 +170,7 @@ def compare_depths(
     for done, camera in enumerate(cameras, 1):
         depths = renderer.render(camera, median=True).median
         assert depths is not None
-        rows, z, surface = _in_frame(points, camera, depths)
+        rows, z, surface = _find_in_frame(points, camera, depths)
         shown = z < (1 + _SURFACE_SLACK) * surface
         seen = rows[shown | (surface == 0)]
         unoccluded[seen[seen < count]] = True
@@ -193,7 +195,7 @@ def compare_depths(
     return unoccluded, (shares[:count], ends)
 
 
-def _in_frame(
+def _find_in_frame(
     points: NDArray[np.float64], camera: Camera, depths: NDArray[np.float32]
 ) -> tuple[NDArray[np.intp], NDArray[np.float64], NDArray[np.float32]]:
     """Return the rows of points in the frame, their depths, and the surface's depths at their pixels."""
@@ -212,7 +214,7 @@ def extent_of(splats: Splats) -> tuple[list[float], float]:
     return middle.tolist(), float(np.percentile(np.linalg.norm(means - middle, axis=1), 99))
 
 
-def _giants(splats: Splats, middle: Sequence[float], radius: float) -> NDArray[np.bool_]:
+def _mark_giants(splats: Splats, middle: Sequence[float], radius: float) -> NDArray[np.bool_]:
     """Mark Gaussians larger than the scene, with its middle within 3σ."""
     means = splats.means.astype(np.float64)
     large = np.flatnonzero(splats.scales.max(axis=1) > radius)
@@ -223,7 +225,7 @@ def _giants(splats: Splats, middle: Sequence[float], radius: float) -> NDArray[n
     return out
 
 
-def _needles(splats: Splats, rest: NDArray[np.bool_], progress: Progress) -> NDArray[np.bool_]:
+def _mark_needles(splats: Splats, rest: NDArray[np.bool_], progress: Progress) -> NDArray[np.bool_]:
     """Mark long, thin Gaussians of `rest` with both ends (2σ) beyond 3σ of their nearest neighbours.
 
     Neighbours count as spheres of their largest scale: by their true shape eight times as many were needles
@@ -231,7 +233,7 @@ def _needles(splats: Splats, rest: NDArray[np.bool_], progress: Progress) -> NDA
     """
     out = np.zeros(len(splats), bool)
     rows = np.flatnonzero(rest)
-    long, mean_to_end = _elongated(splats, rows)
+    long, mean_to_end = _find_elongated(splats, rows)
     if not len(long) or len(rows) <= 2 * _NEIGHBORS:
         return out
     means = splats.means.astype(np.float64)
@@ -248,7 +250,7 @@ def _needles(splats: Splats, rest: NDArray[np.bool_], progress: Progress) -> NDA
     return out
 
 
-def _elongated(splats: Splats, rows: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
+def _find_elongated(splats: Splats, rows: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
     """Return those of `rows` that are ten times as long as wide, and (n, 3) vectors from mean to end (2σ)."""
     width, length = longer_axes(splats.scales[rows].astype(np.float64)).T
     long = rows[length > NEEDLE_LENGTH * np.maximum(width, 1e-30)]
@@ -257,7 +259,7 @@ def _elongated(splats: Splats, rows: NDArray[np.intp]) -> tuple[NDArray[np.intp]
     return long, 2 * splats.scales[long, axis].astype(np.float64)[:, None] * along
 
 
-def _floaters(
+def _mark_floaters(
     splats: Splats,
     rest: NDArray[np.bool_],
     weight: NDArray[Any],

@@ -147,7 +147,7 @@ def lift_rows(
         centered = centered[firsts]
         rows = rows[firsts]
     progress("lift", 0, len(xyz))
-    quats, scales = _core.lift_points(xyz - _anchor(xyz), config, counter(progress, "lift"))
+    quats, scales = _core.lift_points(xyz - _choose_anchor(xyz), config, counter(progress, "lift"))
     n = len(centered)
     step = np.spacing(np.float32(np.abs(xyz).max()))
     # Other programs ignore offsets, and some keep positions in half floats, which end at 65,504.
@@ -174,7 +174,7 @@ def isolated(splats: Splats) -> str | None:
     return f"{plural(count, 'isolated point')} {text}; remove strays first, as with CloudCompare's SOR filter"
 
 
-def _anchor(points: NDArray[np.float64]) -> NDArray[np.float64]:
+def _choose_anchor(points: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return a point amid others, a multiple of a power of two that is larger than the cells of lines.
 
     So cells are the same in tiles as in the whole cloud.

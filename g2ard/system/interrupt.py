@@ -34,7 +34,7 @@ def status() -> int:
     return 128 + _last
 
 
-def _end(number: int, frame: FrameType | None) -> NoReturn:
+def _end_process(number: int, frame: FrameType | None) -> NoReturn:
     os.write(2, b"g2ard: interrupted\n")
     os._exit(128 + number)
 
@@ -49,7 +49,7 @@ def ends_the_program() -> None:
     """Make both signals end the process with one line, unless another handler is installed."""
     for number, default in ((signal.SIGINT, signal.default_int_handler), (signal.SIGTERM, signal.SIG_DFL)):
         if signal.getsignal(number) is default:
-            signal.signal(number, _end)
+            signal.signal(number, _end_process)
 
 
 class RaisesInterrupt:
@@ -63,7 +63,7 @@ class RaisesInterrupt:
     """
 
     def __enter__(self) -> None:
-        self._replaced = [n for n in (signal.SIGINT, signal.SIGTERM) if signal.getsignal(n) is _end]
+        self._replaced = [n for n in (signal.SIGINT, signal.SIGTERM) if signal.getsignal(n) is _end_process]
         for number in self._replaced:
             signal.signal(number, signal.default_int_handler if number == signal.SIGINT else terminate)
         self._report = sys.unraisablehook
@@ -75,7 +75,7 @@ class RaisesInterrupt:
         self._again = False
         sys.unraisablehook = self._report
         for number in self._replaced:
-            signal.signal(number, _end)
+            signal.signal(number, _end_process)
 
     def _lost(self, lost: Any) -> None:
         if not issubclass(lost.exc_type, KeyboardInterrupt):

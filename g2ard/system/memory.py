@@ -24,20 +24,20 @@ def usable_memory(root: Path = Path("/")) -> int:
         machine = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     except (AttributeError, ValueError, OSError):
         machine = _UNKNOWN_BYTES
-    return min([machine, *_group_limits(root)])
+    return min([machine, *_find_group_limits(root)])
 
 
-def _group_limits(root: Path) -> Iterator[int]:
+def _find_group_limits(root: Path) -> Iterator[int]:
     """Yield the memory limits of this process's control groups and of those above them."""
     with suppress(OSError, ValueError):
         for line in (root / "proc/self/cgroup").read_text(encoding="utf-8").splitlines():
             _, controllers, group = line.split(":", 2)
             for controller in controllers.split(","):
                 for folder in _LIMITS.get(controller, ()):
-                    yield from _limits_of(root / "sys/fs/cgroup" / folder, Path(group.strip("/")))
+                    yield from _read_limits(root / "sys/fs/cgroup" / folder, Path(group.strip("/")))
 
 
-def _limits_of(mounted: Path, group: Path) -> Iterator[int]:
+def _read_limits(mounted: Path, group: Path) -> Iterator[int]:
     # A container may name a group of its host, of which it sees only the uppermost folder.
     for above in (group, *group.parents):
         for name in _LIMIT_FILES:

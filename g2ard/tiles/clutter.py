@@ -39,7 +39,8 @@ def clutter(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
     cameras = cropped(cameras_of(inputs["views"]).recentred(own.offset), own, settings)
     pixels = cameras.widths.astype(int) * cameras.heights
     cameras = cameras.take(np.flatnonzero(pixels > 1)).recentred(-own.offset)
-    seen, count = visibility(amid, cameras, telling), len(own)
+    seen = visibility(amid, cameras, telling)
+    count = len(own)
     light = seen.weight[:count]
     share = light.sum() / max(seen.weight.sum(), 1e-30)
     unoccluded, _ = compare_depths(amid, cameras, floating=False)

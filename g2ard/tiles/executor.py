@@ -59,7 +59,8 @@ class Workers:
 
     def run(self, tasks: Sequence[Task], stage: str) -> list[Path]:
         """Run the tasks that are not done; return the files of all, in order."""
-        total, deaths = sum(task.cost for task in tasks), 0
+        total = sum(task.cost for task in tasks)
+        deaths = 0
         while todo := [task for task in tasks if not task.done]:
             drop_temporaries(self.folder)  # of workers that were killed, as the shares
             for task in todo:
@@ -134,7 +135,8 @@ class _Cluster:
     """A connection to a Dask scheduler, which is asked from time to time whether it has workers."""
 
     def __init__(self, scheduler: str, client: Any) -> None:
-        self.scheduler, self.client = scheduler, client
+        self.scheduler = scheduler
+        self.client = client
         self._asked = self._manned = time.monotonic()
 
     def check(self) -> None:
@@ -176,7 +178,9 @@ class _Pool:
         threads: int,
         cluster: _Cluster | None = None,
     ):
-        self._opened, self._threads, self._cluster = opened, threads, cluster
+        self._opened = opened
+        self._threads = threads
+        self._cluster = cluster
         self._lanes: dict[str, str] = {}  # instruction set → one worker that has it
         self._pool: concurrent.futures.Executor | None = None
 

@@ -35,7 +35,9 @@ class Sights:
 
     def __init__(self, run: TiledRun, cameras: Cameras, frame: tuple[float, ...]):
         usual, others = usual_and_others(cameras)
-        self.run, self.usual, self.others = run, len(usual), len(others)
+        self.run = run
+        self.usual = len(usual)
+        self.others = len(others)
         self.cameras = Cameras.of([*usual, *others]).resized(LONGEST)
         self.shrunk = float((self.cameras.widths[: self.usual] / usual.widths).mean())
         self.views = written(run.workers.folder, self.cameras)
@@ -72,7 +74,9 @@ class Sights:
 
     def _light(self) -> NDArray[np.float64]:
         """Return (V, T) Σ αT² of each tile's coarse Gaussians in each view."""
-        coarse, store, workers = self.run.coarse, self.run.store, self.run.workers
+        coarse = self.run.coarse
+        store = self.run.store
+        workers = self.run.workers
         here = self.cameras.recentred(store.offset)
         usual = here.positions[: self.usual, None]
         away = np.linalg.norm(usual - self.boxes.mean(axis=1), axis=2).min(axis=1)
@@ -96,7 +100,8 @@ class Sights:
 
     def _chosen(self, light: NDArray[np.float64], tile: int) -> dict[str, Any]:
         """Choose the views of a tile, evenly spaced among those that see it."""
-        usual, others = light[: self.usual], light[self.usual :]
+        usual = light[: self.usual]
+        others = light[self.usual :]
         sight = in_sight(usual, tile)
         some = sight[evenly_spaced(len(sight), MOST_VIEWS)]
         return {
@@ -110,7 +115,8 @@ class Sights:
 
 def levels_of(boxes: NDArray[np.float64], tile: int) -> list[str | None]:
     """Return the coarse level of every tile in views of `tile`, None for itself."""
-    low, high = boxes[:, 0], boxes[:, 1]
+    low = boxes[:, 0]
+    high = boxes[:, 1]
     gaps = np.maximum(0.0, np.maximum(low - high[tile], low[tile] - high))
     near = np.linalg.norm(gaps, axis=1) <= np.linalg.norm(high[tile] - low[tile])
     levels: list[str | None] = ["near" if is_near else "far" for is_near in near]

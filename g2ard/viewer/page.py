@@ -73,16 +73,16 @@ def write_page(
         Bytes of the page, and of each scene as .sog.
     """
     path = check_page_output(path, overwrite)
-    packed = [_sog(path, label, splats, progress) for label, splats in scenes]
+    packed = [_pack(path, label, splats, progress) for label, splats in scenes]
     shown = {
         "start": None if start is None else asdict(start),
         "stops": [{"title": title, **asdict(stop)} for title, stop in stops],
-        "background": _colour(background),
+        "background": _list_channels(background),
         "files": [f"scene{index}.sog" for index in range(len(scenes))],
         "antialiased": [splats.antialiased for _, splats in scenes],
         "placed": None,
     }
-    size = _write(path, _page([label for label, _ in scenes], shown, packed), overwrite)
+    size = _write(path, _fill_page([label for label, _ in scenes], shown, packed), overwrite)
     return size, tuple(map(len, packed))
 
 
@@ -92,7 +92,7 @@ def room_for_scene(size: int) -> int:
     >>> room_for_scene(10_000_000) // 1_000_000
     6
     """
-    room = (size - len(_page(["?" * 100], {}, []).encode()) - 1000) * 3 // 4
+    room = (size - len(_fill_page(["?" * 100], {}, []).encode()) - 1000) * 3 // 4
     if room <= 0:
         raise InputError(
             f"{size:,} bytes are too few; the viewer takes {size - room * 4 // 3:,}", parameter="fit"
@@ -117,12 +117,12 @@ def write_stream_page(
     shown = {
         "start": None if start is None else asdict(start),
         "stops": [],
-        "background": _colour(background),
+        "background": _list_channels(background),
         "files": ["lod-meta.json"],
         "antialiased": [antialiased],
         "placed": {"rotation": [float(q) for q in rotation], "position": [float(x) for x in position]},
     }
-    return _write(Path(path), _page([title], shown, []), overwrite=True)
+    return _write(Path(path), _fill_page([title], shown, []), overwrite=True)
 
 
 def write_globe_page(
@@ -142,9 +142,9 @@ def write_globe_page(
         "eye": [float(x) for x in eye],
         "target": [float(x) for x in target],
         "fov": [[float(aspect), float(degrees)] for aspect, degrees in fov],
-        "background": _colour(background),
+        "background": _list_channels(background),
     }
-    text = _part("globe.html").replace("{fit}", _part("fit.js"))
+    text = _read_part("globe.html").replace("{fit}", _read_part("fit.js"))
     text = text.replace("{generator}", f"g2ard {__version__}").replace("{title}", escape(title))
     return _write(Path(path), text.replace("{view}", json.dumps(view)), overwrite=True)
 
@@ -155,11 +155,11 @@ def _write(path: Path, text: str, overwrite: bool) -> int:
         return temporary.stat().st_size
 
 
-def _colour(background: Sequence[float] | None) -> list[float] | None:
+def _list_channels(background: Sequence[float] | None) -> list[float] | None:
     return None if background is None else [float(channel) for channel in background]
 
 
-def _sog(path: Path, label: str, splats: Splats, progress: Progress) -> bytes:
+def _pack(path: Path, label: str, splats: Splats, progress: Progress) -> bytes:
     packed = sog_bytes(path, replace(splats, offset=np.zeros(3)), progress)
     if len(packed) > _LARGEST_SOG_BYTES:
         raise InputError(
@@ -170,7 +170,7 @@ def _sog(path: Path, label: str, splats: Splats, progress: Progress) -> bytes:
     return packed
 
 
-def _label(text: str, *, switch: bool) -> str:
+def _write_label(text: str, *, switch: bool) -> str:
     """Return a scene's label; of two scenes, it is a button that shows this one alone."""
     if not switch:
         return f'<p class="label">{escape(text)}</p>'
@@ -178,23 +178,23 @@ def _label(text: str, *, switch: bool) -> str:
     return f'<button type="button" class="label" aria-pressed="false" title="{title}">{escape(text)}</button>'
 
 
-def _part(name: str) -> str:
+def _read_part(name: str) -> str:
     return (_HERE / name).read_text(encoding="utf-8")
 
 
-def _page(labels: Sequence[str], shown: object, packed: Sequence[bytes]) -> str:
+def _fill_page(labels: Sequence[str], shown: object, packed: Sequence[bytes]) -> str:
     data = (
         f'<script type="text/plain" id="scene{index}">{base64.b64encode(sog).decode()}</script>'
         for index, sog in enumerate(packed)
     )
-    return _part("page.html").format(
+    return _read_part("page.html").format(
         generator=f"g2ard {__version__}",
         title=escape(" | ".join(labels)),
-        notice=_NOTICE + _part("supersplat/LICENSE"),
-        style=_part("supersplat/index.css") + _part("page.css"),
-        labels="\n".join(_label(label, switch=len(labels) > 1) for label in labels),
+        notice=_NOTICE + _read_part("supersplat/LICENSE"),
+        style=_read_part("supersplat/index.css") + _read_part("page.css"),
+        labels="\n".join(_write_label(label, switch=len(labels) > 1) for label in labels),
         view=json.dumps(shown).replace("<", "\\u003c"),
         viewer=base64.b64encode((_HERE / "supersplat/index.js.gz").read_bytes()).decode(),
         scenes="\n".join(data),
-        script=_part("fit.js") + _part("page.js"),
+        script=_read_part("fit.js") + _read_part("page.js"),
     )

@@ -36,8 +36,8 @@ def test_import_and_help_load_nothing_heavy() -> None:
 def test_config_files_are_utf_8(tmp_path: Path, mark: bytes) -> None:
     """Any locale works, also with the byte order mark that editors on Windows write."""
     (tmp_path / "c.toml").write_bytes(mark + 'output = "größe/×.ply"\n'.encode())
-    code = "import sys; from pathlib import Path; from g2ard.cli.config_file import _read;"
-    code += "print(ascii(_read(Path(sys.argv[1]))))"
+    code = "import sys; from pathlib import Path; from g2ard.cli.config_file import _read_toml;"
+    code += "print(ascii(_read_toml(Path(sys.argv[1]))))"
     plain = {**os.environ, "LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
     done = subprocess.run(
         [sys.executable, "-c", code, tmp_path / "c.toml"], env=plain, capture_output=True, text=True

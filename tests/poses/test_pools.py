@@ -330,14 +330,14 @@ def test_a_pool_planned_on_a_sample_looks_at_the_same_thing(scenes: dict[str, Sp
 
 def test_a_grown_pool_keeps_the_kinds_of_the_first(monkeypatch: pytest.MonkeyPatch) -> None:
     """More poses from above are lower, and may all look blurred where fewer do not."""
-    plan, asked = pool_module._planned, []
+    plan, asked = pool_module._plan, []
 
     def flipping(survey: Survey, kind: str, count: int) -> tuple[Poses, list[str], str]:
         asked.append(count)
         return plan(survey, "orbit" if len(asked) == 1 else "sharp", count)
 
-    monkeypatch.setattr(pool_module, "_planned", flipping)
-    monkeypatch.setattr(pool_module, "_held", lambda survey, poses: 0.25)
+    monkeypatch.setattr(pool_module, "_plan", flipping)
+    monkeypatch.setattr(pool_module, "_measure_share_held", lambda survey, poses: 0.25)
     found = plan_pool(naive.statue(), 16, grow=2.0)
     assert asked == [16, 32]
     assert len(found.cameras) == 32
@@ -346,7 +346,7 @@ def test_a_grown_pool_keeps_the_kinds_of_the_first(monkeypatch: pytest.MonkeyPat
 
 def test_a_larger_pool_keeps_poses_of_kinds_that_it_would_not_use(monkeypatch: pytest.MonkeyPatch) -> None:
     """Poses that the larger number judges otherwise stay; the rest is evenly spread over the new ones."""
-    planned = pool_module._planned
+    planned = pool_module._plan
 
     def changing(survey: Survey, kind: str, count: int) -> tuple[Poses, list[str], str]:
         poses, _, why = planned(survey, "orbit", count)
@@ -354,8 +354,8 @@ def test_a_larger_pool_keeps_poses_of_kinds_that_it_would_not_use(monkeypatch: p
 
     scene = SCENES["statue"]()
     alone = plan_pool(scene, 12)
-    monkeypatch.setattr(pool_module, "_planned", changing)
-    monkeypatch.setattr(pool_module, "_held", lambda *_: 0.25)
+    monkeypatch.setattr(pool_module, "_plan", changing)
+    monkeypatch.setattr(pool_module, "_measure_share_held", lambda *_: 0.25)
     grown = plan_pool(scene, 12, grow=2)
     assert len(grown.cameras) == 24
     assert grown.kind == "orbit + sharp"

@@ -206,8 +206,8 @@ def test_nan_is_no_perfect_score() -> None:
     for mask in (None, everywhere):
         assert np.isnan([score(image, spoilt, mask) for score in (psnr, ssim, edge_psnr, detail)]).all()
     targets = Spoilt(views)
-    assert np.isnan(Probe(targets, BLACK).all_of(ball))
-    assert np.isnan(Probe(targets, BLACK, 40.0).all_of(ball))
+    assert np.isnan(Probe(targets, BLACK).score(ball))
+    assert np.isnan(Probe(targets, BLACK, 40.0).score(ball))
 
 
 class Spoilt:

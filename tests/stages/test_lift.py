@@ -5,7 +5,7 @@ import pytest
 
 from g2ard.errors import InputError
 from g2ard.scene.splats import SH_C0
-from g2ard.stages.lift import _anchor, isolated, lift
+from g2ard.stages.lift import _choose_anchor, isolated, lift
 from helpers.clouds import lines, surface
 from helpers.threads import on_threads
 from reference.lift import discs
@@ -17,7 +17,7 @@ def test_spread_is_an_option():
     np.testing.assert_allclose(0.5 + SH_C0 * got.sh0[:, 0], 0.25, atol=1e-6)
     np.testing.assert_allclose(got.opacities, 0.5, atol=1e-6)
     assert got.sh_degree == 0
-    _, want_scales = discs(points - _anchor(points), spread=0.6)
+    _, want_scales = discs(points - _choose_anchor(points), spread=0.6)
     np.testing.assert_allclose(got.scales, want_scales, rtol=1e-5)
 
 

@@ -5,7 +5,7 @@ import pytest
 
 from g2ard import Renderer
 from g2ard.scene.cameras import Camera
-from g2ard.stages.lift import _anchor, lift
+from g2ard.stages.lift import _choose_anchor, lift
 from helpers.clouds import lines, surface
 from helpers.similarities import turn
 from reference.lift import discs
@@ -194,7 +194,7 @@ CLOUDS = {
 def test_discs_are_the_naive_twin_s(name):
     points = CLOUDS[name]
     got = lift(points, np.full_like(points, 0.25))
-    want_normals, want_scales = discs(points - _anchor(points))
+    want_normals, want_scales = discs(points - _choose_anchor(points))
     np.testing.assert_allclose(got.scales, want_scales, rtol=1e-4)
     np.testing.assert_allclose(np.abs((normals(got) * want_normals).sum(1)), 1, atol=1e-4)
 

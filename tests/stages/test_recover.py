@@ -345,7 +345,7 @@ def test_a_recovery_that_time_ends_says_what_it_missed(student: Splats, targets:
     assert done.steps < planned == done.planned
     looked = 1 + min(step for step, (seconds, _) in seen.items() if seconds >= 0.75 * 6.0)
     before, after = (
-        probe.Probe(targets, config.background).all_of(seen[step][1]) for step in (looked, done.steps)
+        probe.Probe(targets, config.background).score(seen[step][1]) for step in (looked, done.steps)
     )
     assert done.pace == pytest.approx(100 * (after - before) / (done.steps - looked))
     gaining = f"it was still gaining {done.pace:.1f} dB" if done.pace >= 0.05 else "it gained under 0.05 dB"
@@ -375,7 +375,7 @@ def test_progress_figures(student: Splats, targets: TeacherRenders, monkeypatch:
     shown = {tuple(re.findall(r"[\d.]+", figures["PSNR"])) for *_, figures in seen[:-1]}
     assert len(shown) > 2
     for value, step in shown:  # each is of the step it names
-        want = probe.Probe(targets, (0.0, 0.0, 0.0)).all_of(scenes[int(step)])
+        want = probe.Probe(targets, (0.0, 0.0, 0.0)).score(scenes[int(step)])
         assert float(value) == pytest.approx(want, abs=0.0051)
 
 

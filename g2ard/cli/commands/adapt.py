@@ -50,7 +50,7 @@ def adapt(
     if teacher is not None and not photos:
         run.refuse_typed("with --teacher, unless --photos is given", "images", "alpha")
     background = opt.background_of(run, background, compact)
-    settings, _ = run.settled(AdaptConfig(), preset)
+    settings, _ = run.settle(AdaptConfig(), preset)
     opt.check_engine(settings.get("adapt.engine"))
     config = configured(AdaptConfig(), preset or "auto", settings)
     work = place_checkpoint(output, ".work")

@@ -102,14 +102,13 @@ def compare(
                 cameras = Cameras.of([*cameras, *best])
             else:
                 stand = frame_with(dense, cameras)
-            shown = {"typical": str(stand.name)} | {f"worst {i}": v.name for i, v in enumerate(worst, 1)}
-            stops = [
-                (
-                    f"{what}: {name}, {psnr[name]:.1f} dB",
-                    stand.start_at(cameras[cameras.names.index(name)], points),
-                )
-                for what, name in shown.items()
-            ]
+            shown = {"typical": str(stand.name)}
+            for number, view in enumerate(worst, 1):
+                shown[f"worst {number}"] = view.name
+            stops = []
+            for what, name in shown.items():
+                camera = cameras[cameras.names.index(name)]
+                stops.append((f"{what}: {name}, {psnr[name]:.1f} dB", stand.start_at(camera, points)))
             labels = label_scenes(sources, [len(dense), len(other)], roles)
             scenes = [(label, stand.of(splats)) for label, splats in zip(labels, (dense, other), strict=True)]
             write_page(

@@ -102,7 +102,7 @@ def distill(
     from g2ard.pipeline.config import DistillConfig
     from g2ard.report.distilled import Drawn
 
-    settings, _ = run.settled(DistillConfig(), preset)
+    settings, _ = run.settle(DistillConfig(), preset)
     budget = read_budget(run, optional=scene is None)
     given = views is not None and not is_made(views)
     _check_options(scene, views, held_out, photos)
@@ -149,7 +149,7 @@ def distill(
             return
         check_job_memory(job, tiling.memory, cost.bytes)
         name = scene or Path(str(views))
-        with folder.held(job):
+        with folder.hold(job):
             done: Any = job.run(folder.unfinished)
             folder.write(done, job.views, job.targets)
             drawn = None

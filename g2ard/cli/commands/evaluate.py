@@ -275,6 +275,10 @@ def _describe_own_size(names: list[str], rows: list[dict[str, Any]]) -> str:
     return f"at the views' own size ({scores[0]['scored_in']}): {'; '.join(told)}"
 
 
+def _format_lpips(scores: dict[str, float]) -> str:
+    return " ".join(f"{net} {value:.4f}" for net, value in scores.items())
+
+
 def _print_table(run: Run, title: str, rows: list[dict[str, Any]]) -> None:
     from g2ard.rendering.metrics import METRICS
 
@@ -287,7 +291,7 @@ def _print_table(run: Run, title: str, rows: list[dict[str, Any]]) -> None:
         "overdraw": [f"{r['overdraw']:.1f}" for r in rows],
     }
     if all(r["lpips"] for r in rows):
-        columns["LPIPS"] = [" ".join(f"{net} {value:.4f}" for net, value in r["lpips"].items()) for r in rows]
+        columns["LPIPS"] = [_format_lpips(row["lpips"]) for row in rows]
     if all(r["drift95"] is not None for r in rows):
         columns["Drift95"] = [f"{r['drift95']:.3g}" for r in rows]
     cells = [list(row) for row in zip(*columns.values(), strict=True)]

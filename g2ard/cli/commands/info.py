@@ -120,9 +120,10 @@ def _measure_overdraw(splats: Splats) -> dict[str, Any]:
 
 def _read_scores(report: dict[str, Any]) -> tuple[str, dict[str, dict[str, float]]]:
     """Return the name of a run's targets and its scores."""
-    return report["against"], {
-        name: {k: found[k] for k in ("psnr", "ssim")} for name, found in report["scores"].items()
-    }
+    scores = {}
+    for name, found in report["scores"].items():
+        scores[name] = {"psnr": found["psnr"], "ssim": found["ssim"]}
+    return report["against"], scores
 
 
 def _list_stopped(path: Path, stopped: dict[str, Any]) -> list[list[str]]:

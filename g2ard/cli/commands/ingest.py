@@ -70,7 +70,7 @@ def ingest(
             source,
             output,
             tile_rows=tiling.most_rows,
-            lift=run.settled(LiftConfig())[1],
+            lift=run.settle(LiftConfig())[1],
             render_model=run.render_model,
             overwrite=run.overwrite,
             runs=runs,

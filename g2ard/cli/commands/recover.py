@@ -59,7 +59,7 @@ def recover(
     if teacher is not None and not photos:
         run.refuse_typed("with --teacher, unless --photos is given", "alpha")
     background = opt.background_of(run, background, student)
-    settings, _ = run.settled(RecoverConfig(), preset)
+    settings, _ = run.settle(RecoverConfig(), preset)
     with run.usage():
         check_teacher(views, teacher)
     checkpoint = place_checkpoint(output, ".checkpoint.npz")

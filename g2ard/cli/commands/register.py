@@ -100,7 +100,7 @@ def register(
     from g2ard.stages.register import RegisterConfig
     from g2ard.stages.register.report import KEPT
 
-    config = run.settled(RegisterConfig())[1]
+    config = run.settle(RegisterConfig())[1]
     if config.matcher == "direct":
         run.refuse_typed("with --matcher direct, which matches no features", "refine", "passes")
     if intrinsics is not None and focal is not None:

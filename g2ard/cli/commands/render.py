@@ -6,6 +6,7 @@ import math
 from collections import deque
 from collections.abc import Iterator
 from contextlib import nullcontext
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -139,7 +140,8 @@ def render(
     check_single(len(cameras))
     places = output_names(cameras.source or str(views), cameras.names) if output is not None else []
     if output is not None:
-        run.claim("--output", *(file for place in places for file in _name_files(output / place, depth)))
+        files = (_name_files(output / place, depth) for place in places)
+        run.claim("--output", *chain.from_iterable(files))
     shown: list[NDArray[np.uint8]] = []
     colour = opt.background_of(run, background, scene) or BLACK
     generated = turn is not None or looks is not None or is_planned(found)

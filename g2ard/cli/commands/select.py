@@ -57,7 +57,7 @@ def select(
     from g2ard.stages.select import CoverageOptions
     from g2ard.stages.select import select as choose
 
-    settings = run.settled(SelectConfig(), preset)[0]
+    settings = run.settle(SelectConfig(), preset)[0]
     if k is not None:
         settings["select.views_count"] = k.value if isinstance(k, Count) else k
     if views is None:

@@ -75,7 +75,7 @@ def simplify(
     from g2ard.jobs.tile_options import is_tiled
     from g2ard.stages.simplify import SimplifyConfig
 
-    config = run.settled(SimplifyConfig(), preset)[1]
+    config = run.settle(SimplifyConfig(), preset)[1]
     budgets = read_budgets(run)
     if views is not None and no_views:
         raise typer.BadParameter("--views and --no-views exclude each other; give one")

@@ -161,9 +161,9 @@ def median_colors(
         progress("colour points", done, len(cameras))
         few = np.flatnonzero(count < _SEEN)
         if hiding is None:
-            pixels, visible = (found[own[few]] for found in _seen(positions, positions, cameras, view))
+            pixels, visible = (found[own[few]] for found in _find_seen(positions, positions, cameras, view))
         else:
-            pixels, visible = _seen(positions[own[few]], hiding, cameras, view)
+            pixels, visible = _find_seen(positions[own[few]], hiding, cameras, view)
         pixels = pixels[visible]
         rows = few[visible]
         if not len(rows):
@@ -185,7 +185,7 @@ def median_colors(
     return colors, count > 0
 
 
-def _seen(
+def _find_seen(
     positions: NDArray[np.float64], hiding: NDArray[np.float64], cameras: Cameras, view: int
 ) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
     """Return (N, 2) columns and rows of points in a view, and whether they are inside and not hidden."""

@@ -70,8 +70,8 @@ def visual_hull(cameras: Cameras, outlines: Sequence[Mask | None], middle: Float
     for count in (_COARSE_VOXELS, _FINE_VOXELS):
         side = size / count
         middle = low + size / 2
-        views = [_outlined(cameras, view, outlines[view], middle, side) for view in told]
-        filled = _carved(views, low, side, count)
+        views = [_outline_view(cameras, view, outlines[view], middle, side) for view in told]
+        filled = _carve(views, low, side, count)
         if not filled.any():
             return None
         occupied = np.argwhere(filled)
@@ -80,7 +80,7 @@ def visual_hull(cameras: Cameras, outlines: Sequence[Mask | None], middle: Float
     return hull
 
 
-def _outlined(
+def _outline_view(
     cameras: Cameras, view: int, outline: Mask | None, middle: Float, side: Float
 ) -> tuple[Float, Mask]:
     """Return a view's (3, 4) projection to pixels, and the pixels that a voxel touching the object may have:
@@ -92,7 +92,7 @@ def _outlined(
     return projection, grown(outline, int(np.ceil(radius)))
 
 
-def _carved(views: Sequence[tuple[Float, Mask]], low: Float, side: Float, count: int) -> Mask:
+def _carve(views: Sequence[tuple[Float, Mask]], low: Float, side: Float, count: int) -> Mask:
     """Return the (count, count, count) voxels that are in sight and within the outlines."""
     steps = np.arange(count) + 0.5
     filled = np.zeros((count, count * count), bool)

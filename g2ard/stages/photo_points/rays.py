@@ -98,9 +98,9 @@ def points_along_rays(
         outlines.append(outline if outline is None or mask is None else outline | ~mask)
         progress("photos", view + 1, len(cameras))
     rng = np.random.default_rng([seed, 11])
-    centre = _common_centre(cameras)
+    centre = _find_common_centre(cameras)
     distances = np.linalg.norm(cameras.positions - centre, axis=1)
-    near = [_neighbours(cameras, i) for i in range(len(cameras))]
+    near = [_find_neighbours(cameras, i) for i in range(len(cameras))]
     hull = visual_hull(cameras, outlines, centre)
     found, tried = Points(np.zeros((0, 3)), np.zeros((0, 3), np.float32)), 0
     while len(found) < count:
@@ -119,14 +119,14 @@ def points_along_rays(
             depths = hull.depths(cameras, view, _HULL_DEPTHS)
         slack = 2.0 ** (tried // (_RAYS_PER_DOUBLING * max(count, _RAYS)))
         rays = _Rays.of(cameras, photos, view, near[view], pixels)
-        xyz, rgb = _swept(rays, depths, hull, slack)
+        xyz, rgb = _sweep(rays, depths, hull, slack)
         tried += some
         found = distinct(Points(np.concatenate([found.positions, xyz]), np.concatenate([found.colors, rgb])))
         progress("points", min(len(found), count), count)
     return Points(found.positions[:count], np.ascontiguousarray(found.colors[:count]))
 
 
-def _common_centre(cameras: Cameras) -> Float:
+def _find_common_centre(cameras: Cameras) -> Float:
     """Return the (3,) point nearest to all optical axes, or a point ahead of the mean camera if they hardly
     cross."""
     across = np.eye(3) - cameras.forwards[:, :, None] * cameras.forwards[:, None, :]
@@ -140,7 +140,7 @@ def _common_centre(cameras: Cameras) -> Float:
     return middle if before.mean() > 0.5 else ahead
 
 
-def _neighbours(cameras: Cameras, view: int) -> NDArray[np.int64]:
+def _find_neighbours(cameras: Cameras, view: int) -> NDArray[np.int64]:
     """Return the views nearest to one in position and direction."""
     away = np.linalg.norm(cameras.positions - cameras.positions[view], axis=1) / (cameras.extent or 1.0)
     turn = 1 - cameras.forwards @ cameras.forwards[view]
@@ -175,7 +175,7 @@ class _Photo:
         return cls(image, mask, shown & ~grown(~mask, step), step)
 
 
-def _swept(
+def _sweep(
     ray: _Rays, depths: Float, hull: VisualHull | None, slack: float
 ) -> tuple[Float, NDArray[np.float32]]:
     """Return points on rays, with colours.
@@ -197,12 +197,12 @@ def _swept(
         finite = np.isfinite(cost)
         middle = np.maximum(finite.sum(1) // 2, 1) - 1
         usual = np.sort(cost, axis=1)[rows, middle]  # the median, since infinities are sorted last
-        depth, least = _refined(ray, trial, cost)
+        depth, least = _refine(ray, trial, cost)
         kept = finite.any(1) & (least <= slack * np.minimum(_MOST_POINT_COST, _MOST_POINT_COST_SHARE * usual))
     return ray.at(depth[:, None])[kept, 0], ray.colors[kept]
 
 
-def _refined(ray: _Rays, trial: Float, cost: Float) -> tuple[Float, Float]:
+def _refine(ray: _Rays, trial: Float, cost: Float) -> tuple[Float, Float]:
     """Return the (N,) best depths and their costs, from finer trials around the best minima of each ray.
 
     `trial` and `cost` are (N, D); depths are evenly spaced in 1/depth. The finer trials reach three quarters

@@ -78,13 +78,13 @@ class Guard:
         """Score the best scene again, after a change of the score."""
         self.best_score = self.before if self.best is self.start else self.score(self.best)
 
-    def due(self, share: float) -> bool:
+    def is_due(self, share: float) -> bool:
         """Return whether the scene should be scored at this share of the horizon."""
         return self.active and self.looked < len(LOOKS) and LOOKS[self.looked] <= share < 1
 
     def look(self, scene: Splats, share: float, step: int) -> Literal["on", "back", "stop"]:
         """Score a scene, and decide to go on, to go back to the best one with smaller steps, or to stop."""
-        while self.due(share):
+        while self.is_due(share):
             self.looked += 1
         value = self.score(scene)
         self.scores.append((step, value))
@@ -104,10 +104,13 @@ class Guard:
         self.backed_off.append({"step": step, "psnr": value})
         return "back"
 
-    def pace(self, step: int, value: float) -> float | None:
+    def measure_pace(self, step: int, value: float) -> float | None:
         """Return the gain in dB per 100 steps since the latest earlier look; None without one."""
         earlier = [look for look in self.scores if look[0] < step]
-        return 100 * (value - earlier[-1][1]) / (step - earlier[-1][0]) if earlier else None
+        if not earlier:
+            return None
+        before, score = earlier[-1]
+        return 100 * (value - score) / (step - before)
 
     @property
     def lost(self) -> float:
@@ -120,7 +123,7 @@ class Guard:
         before, now = (self.validation[look]["psnr"] for look in (0, -1))
         return sum(before[kind] - now[kind] for kind in before) / len(before)
 
-    def _gain(self, scores: dict[str, float]) -> float:
+    def _find_least_gain(self, scores: dict[str, float]) -> float:
         """Return the least gain of a kind of validation view against the start."""
         before = self.validation[0]["psnr"]
         return min(scores[kind] - before[kind] for kind in before)
@@ -141,37 +144,37 @@ class Guard:
         """
         if self.others is None:
             return result, 0.0
-        best, scores, mean = self._judged(result)
+        best, scores, mean = self._judge(result)
         kept: float | None = 0.0
         self.validation.append({"step": step, "psnr": scores})
         for k in _PRIOR_VIEWS:
-            other = self._judged(blend(self.start, result, views / (views + k)))
+            other = self._judge(blend(self.start, result, views / (views + k)))
             if not other[2] > mean + _LEAST_GAIN:
                 break
             kept = k
             (best, scores, mean) = other
         if (harmful := self.harmful(best)) is not None:
-            other = self._judged(blend(self.start, best, ~harmful))
+            other = self._judge(blend(self.start, best, ~harmful))
             if other[2] > mean:
                 best, scores, mean = other
-        gain = mean - self._mean(self.before, self.validation[0]["psnr"])
-        if self._gain(scores) < -_TOLERATED_LOSS or not gain > _LEAST_GAIN:
-            best, kept, scores = self._least_harm(result, views)
+        gain = mean - self._average(self.before, self.validation[0]["psnr"])
+        if self._find_least_gain(scores) < -_TOLERATED_LOSS or not gain > _LEAST_GAIN:
+            best, kept, scores = self._find_least_harm(result, views)
         if best is not result:
             self.validation.append({"step": step, "psnr": scores})
         return best, kept
 
-    def _judged(self, scene: Splats) -> tuple[Splats, dict[str, float], float]:
+    def _judge(self, scene: Splats) -> tuple[Splats, dict[str, float], float]:
         """Return a scene, its scores by kind of validation view, and their mean with the training views'."""
         assert self.others is not None
         scores = self.others(scene)
-        return scene, scores, self._mean(self.score(scene), scores)
+        return scene, scores, self._average(self.score(scene), scores)
 
-    def _mean(self, trained: float, scores: dict[str, float]) -> float:
+    def _average(self, trained: float, scores: dict[str, float]) -> float:
         """Return the mean PSNR over training views, `trained`, and the kinds of validation views."""
         return (trained + sum(scores.values())) / (1 + len(scores))
 
-    def _least_harm(
+    def _find_least_harm(
         self, result: Splats, views: NDArray[np.float64]
     ) -> tuple[Splats, float | None, dict[str, float]]:
         """Return the candidate whose worst kind of validation views gains most, its k and its scores."""
@@ -187,11 +190,11 @@ class Guard:
         for k, share in shares:
             part = blend(self.start, result, share)
             found = self.others(part)
-            if self._gain(found) > most:
+            if self._find_least_gain(found) > most:
                 best = part
                 chosen = k
                 scores = found
-                most = self._gain(found)
+                most = self._find_least_gain(found)
         return best, chosen, scores
 
     def choose_by_training(self, result: Splats) -> tuple[Splats, float, float]:
@@ -241,12 +244,13 @@ def blend(start: Splats, end: Splats, share: ArrayLike) -> Splats:
     """
     end = end.narrowed()
     start = start.narrowed(end.offset)
-    (m0, q0, l0, o0, d0, n0), (m1, q1, l1, o1, d1, n1) = (arrays_of(scene) for scene in (start, end))
-    q0 = q0 * np.where((q0 * q1).sum(1, keepdims=True) < 0, -1, 1)
-    pairs = (m0, m1), (q0, q1), (l0, l1), (o0, o1), (d0, d1), (n0, n1)
     weight = np.broadcast_to(np.asarray(share, np.float32), (len(start),))
-    means, quats, log_scales, logits, sh0, shN = (
-        (a + weight.reshape(-1, *[1] * (a.ndim - 1)) * (b - a)).astype(np.float32) for a, b in pairs
-    )
+    mixed = []
+    for row, (a, b) in enumerate(zip(arrays_of(start), arrays_of(end), strict=True)):
+        if row == 1:  # q and −q are the same rotation: take the nearer one
+            a = a * np.where((a * b).sum(1, keepdims=True) < 0, -1, 1)
+        weights = weight.reshape(-1, *[1] * (a.ndim - 1))
+        mixed.append((a + weights * (b - a)).astype(np.float32))
+    means, quats, log_scales, logits, sh0, shN = mixed
     scales = np.exp(log_scales.astype(np.float64)).astype(np.float32)
     return Splats(means, quats, scales, logits, sh0, shN, end.offset, end.render_model, end.up, end.axes)

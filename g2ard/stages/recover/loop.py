@@ -197,7 +197,7 @@ class Loop:
                 if time.monotonic() > end:
                     raise TimeoutError
                 self._learn(engine, step, step / steps, multiplier)
-            return self.probe.all_of(engine.splats())
+            return self.probe.score(engine.splats())
         except DeviceError:
             return self._trial(steps, interrupted, multiplier, end)
 
@@ -255,7 +255,7 @@ class Loop:
         began = time.monotonic()
         saved = time.monotonic()
         with checkpoints.defer_interrupt() as interrupted:
-            while self._used_share() < 1 and self.guard.stopped is None:
+            while self._measure_share() < 1 and self.guard.stopped is None:
                 self._step()
                 self._look()
                 now = time.monotonic()
@@ -273,7 +273,7 @@ class Loop:
                 if interrupted.is_set():
                     raise KeyboardInterrupt
 
-    def _used_share(self) -> float:
+    def _measure_share(self) -> float:
         """Return the used share of the steps or of the time limit."""
         if self.limit is not None:
             return self.seconds / self.limit
@@ -284,7 +284,7 @@ class Loop:
         step = self.done
         regularize = config.regularizers.active and (step + 1) % config.regularizers.period == 0
         began = time.monotonic()
-        loss = self._learn(self.engine, step, self._used_share(), self.multiplier, regularize=regularize)
+        loss = self._learn(self.engine, step, self._measure_share(), self.multiplier, regularize=regularize)
         self.losses.append(loss)
         tally = self.tally[regularize]
         tally[0] += 1
@@ -294,9 +294,9 @@ class Loop:
     def _look(self) -> None:
         """After too large a loss, continue from the best scene with a third of the rates; `run` ends when
         `guard.stopped` is set."""
-        share = self._used_share()
+        share = self._measure_share()
         short = self.config.recovery_time is None and self.config.horizon < _SHORTEST_WITH_GUARD
-        if short or not self.guard.due(share):
+        if short or not self.guard.is_due(share):
             return
         scene = self.engine.splats()
         self._look_at_exposures(scene, share)
@@ -319,11 +319,11 @@ class Loop:
 
     def _score_exposed(self) -> None:
         self.probe.fit_exposures()
-        self.guard.before = self.probe.all_of(self.guard.start)
+        self.guard.before = self.probe.score(self.guard.start)
 
     def _log(self) -> None:
         """Log Drift95 and Needle at every tenth of the recovery."""
-        if len(self.geometry) < int(min(1.0, self._used_share()) * _LOG_POINTS):
+        if len(self.geometry) < int(min(1.0, self._measure_share()) * _LOG_POINTS):
             scene = self.engine.splats()
             figures = {"drift95": drift95(self.anchors, scene.means), "needle": needle_share(scene.scales)}
             self.geometry.append({"step": self.done, **figures})
@@ -342,10 +342,10 @@ class Loop:
         recent = np.mean(self.losses[-20:])
         total = self.config.horizon
         if self.config.recovery_time is not None:
-            total = max(self.done, round(self.done / max(self._used_share(), 1e-9)))
+            total = max(self.done, round(self.done / max(self._measure_share(), 1e-9)))
         figures = {"loss": f"{recent:.4f}", "steps/s": f"{speed:.1f}"}
         if self.done < total:  # the report has the result's
-            shown, at = self.probe.latest(self.engine.splats, self.done, self.seconds)
+            shown, at = self.probe.score_latest(self.engine.splats, self.done, self.seconds)
             figures["PSNR"] = f"{shown:.2f} dB (last measured at step {at:,})"
         progress(stage, self.done, total, figures)
 

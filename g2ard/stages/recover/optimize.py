@@ -100,7 +100,7 @@ def recover(
     validation = validation if config.schedule.guarded else None
     probe = Probe(targets, config.background)
     progress(stage, 0, 0)
-    before = probe.all_of(student)
+    before = probe.score(student)
     view_weights = check_weights(weights, len(targets.cameras))
     exact = skip_same and before >= _SAME_PSNR and config.schedule.guarded
     validation = None if exact else validation
@@ -111,7 +111,7 @@ def recover(
             return None
         return find_harmful_changes(student, scene, validation, targets, config.background)
 
-    guard = Guard(probe.all_of, student, before, others, harmful, config.schedule.guarded)
+    guard = Guard(probe.score, student, before, others, harmful, config.schedule.guarded)
     validation_key = None if validation is None else fingerprint_of(validation)
     end = result = student
     after = before
@@ -127,12 +127,12 @@ def recover(
         progress(stage, 0, 0)
         result, after, blend = guard.choose_by_training(end)
     limited = config.recovery_time is not None and not exact
-    pace = guard.pace(loop.done, after) if limited and result is end else None
+    pace = guard.measure_pace(loop.done, after) if limited and result is end else None
     prior_views: float | None = 0.0
     if result is end and seen is not None:
         result, prior_views = guard.choose_by_validation(end, seen, loop.done)
         if result is not end:
-            after = probe.all_of(result)
+            after = probe.score(result)
             blend = float(result is not student)
     validated = None
     if validation is not None:

@@ -59,7 +59,7 @@ class Probe:
         self._targets = Exposed(self._targets)
         self._scored = None
 
-    def all_of(self, splats: Splats) -> float:
+    def score(self, splats: Splats) -> float:
         """Return the mean PSNR over the views; that of the latest scene is known."""
         if self._scored is None or self._scored[0] is not splats:
             renderer = Renderer(splats, background=self._background)
@@ -67,14 +67,14 @@ class Probe:
             self._scored = splats, float(np.mean(list(scores)))
         return self._scored[1]
 
-    def latest(self, splats: Callable[[], Splats], step: int, seconds: float) -> tuple[float, int]:
+    def score_latest(self, splats: Callable[[], Splats], step: int, seconds: float) -> tuple[float, int]:
         """Return the mean PSNR and its step; the previous ones if scoring has used its share of the time.
 
         `splats` returns the current scene, after `step` steps and `seconds` of recovery.
         """
         if seconds >= self._next:
             began = time.monotonic()
-            self._latest = self.all_of(splats()), step
+            self._latest = self.score(splats()), step
             share = _SCORING_TIME_SHARE if self._next else _FIRST_SCORING_SHARE  # the start is outdated soon
             self._next = seconds + (time.monotonic() - began) / share
         return self._latest
@@ -94,7 +94,7 @@ def score_by_kind(
     probes = {
         kind: Probe(Subset(targets, found), background, _INVISIBLE_PSNR) for kind, found in rows.items()
     }
-    return lambda splats: {kind: probe.all_of(splats) for kind, probe in probes.items()}
+    return lambda splats: {kind: probe.score(splats) for kind, probe in probes.items()}
 
 
 def find_harmful_changes(

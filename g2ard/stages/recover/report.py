@@ -201,12 +201,14 @@ def describe_idle_regularizers(rounds: Sequence[Sequence[RecoverReport]]) -> str
         rounds: the recoveries of each round of a run; the message names rounds if there are several
             recoveries.
     """
-    idle = {
-        f"round {number}" if k == 0 else f"the last recovery of round {number}": done
-        for number, entry in enumerate(rounds, 1)
-        for k, done in enumerate(entry)
-        if not done.kept_start and not done.regularizers.steps and done.regularizers.period and done.steps
-    }
+    idle: dict[str, RecoverReport] = {}
+    for number, entry in enumerate(rounds, 1):
+        for k, done in enumerate(entry):
+            regularized = done.regularizers
+            if done.kept_start or regularized.steps or not regularized.period or not done.steps:
+                continue
+            where = f"round {number}"
+            idle[f"the last recovery of {where}" if k else where] = done
     if not idle:
         return None
     period = next(iter(idle.values())).regularizers.period

@@ -124,5 +124,7 @@ def count_trial_steps(horizon: int, limit: float | None) -> int:
     """
     if limit is not None:
         return _LIMITED_STEPS
+    if horizon < _SHORTEST_HORIZON:
+        return 0
     fewest, most = _TRIAL_STEPS
-    return 0 if horizon < _SHORTEST_HORIZON else min(most, max(fewest, horizon // _TRIAL_DIVISOR))
+    return min(most, max(fewest, horizon // _TRIAL_DIVISOR))

@@ -128,13 +128,13 @@ def normal_equations(
 
     `scale` is σ of the residuals; None estimates it. Results do not depend on the number of threads.
     """
-    matrix, target, *rest = _core.normal_equations(photo, shot, _lens(K), (gain, bias), scale)
+    matrix, target, *rest = _core.normal_equations(photo, shot, _list_lens(K), (gain, bias), scale)
     return Normal(np.array(matrix), np.array(target), *rest)
 
 
 def moves(shot: Shot, K: Float, xi: Float) -> float:
     """Return the root mean square motion, in pixels, of the valid pixels under (v, ω, φ)."""
-    return _core.flow(shot, _lens(K), xi.tolist())
+    return _core.flow(shot, _list_lens(K), xi.tolist())
 
 
 def zoomed(camera: Camera, zoom: float, viewmat: Float) -> Camera:
@@ -156,10 +156,12 @@ def focal_alone(matrix: Float, right: Float, zoom: float) -> tuple[float, float]
 def focal_prior(alone: tuple[float, float], prior: float) -> float:
     """Return σ of a prior of φ that `focal_alone` does not contradict: `prior`, or a wider one."""
     off = abs(alone[0])
-    return min(off, _WIDEST) if off > _CONTRADICTED * np.hypot(alone[1], prior) else prior
+    if off > _CONTRADICTED * np.hypot(alone[1], prior):
+        return min(off, _WIDEST)
+    return prior
 
 
-def _lens(K: Float) -> tuple[float, float, float, float]:
+def _list_lens(K: Float) -> tuple[float, float, float, float]:
     return float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])
 
 
@@ -229,7 +231,9 @@ def _align_level(
             return None
         there = zoomed(camera, zoom, viewmat)
         shot = shot_of(renderer.render(there), config)
-        return (there, shot) if (photo.mask & shot.mask).mean() >= config.min_overlap else None
+        if (photo.mask & shot.mask).mean() >= config.min_overlap:
+            return (there, shot)
+        return None
 
     def equations(
         view: tuple[Camera, Shot], light: tuple[float, float], scale: float | None = None
@@ -247,11 +251,11 @@ def _align_level(
     if view is None:
         return None
     if fresh:
-        light = _light(photo, view[1])
+        light = _match_light(photo, view[1])
     normal = equations(view, light)
     scale = normal.scale
     for _ in range(config.iterations):
-        step = _solved(normal)
+        step = _solve(normal)
         better = False
         for _ in range(_STEP_HALVINGS + 1):
             if step is None:
@@ -305,7 +309,7 @@ def with_prior(normal: Normal, pixels: int, zoom: float, sigma: float, config: R
     return replace(normal, matrix=matrix, right=right, cost=normal.cost + penalty)
 
 
-def _light(photo: Level, shot: Shot) -> tuple[float, float]:
+def _match_light(photo: Level, shot: Shot) -> tuple[float, float]:
     """Return the gain and bias that match the render's mean and spread to the photo's, without alignment."""
     mask = photo.mask & shot.mask
     a = shot.grey[mask]
@@ -315,9 +319,9 @@ def _light(photo: Level, shot: Shot) -> tuple[float, float]:
     return gain, float(b.mean() - gain * a.mean())
 
 
-def _solved(normal: Normal) -> Float | None:
+def _solve(normal: Normal) -> Float | None:
     """Solve the normal equations with unit diagonal scaling; return None if an unknown is undetermined."""
-    if (unit_scaled := _unit_scaled(normal.matrix)) is None:
+    if (unit_scaled := _scale_to_unit(normal.matrix)) is None:
         return None
     scaled, unit = unit_scaled
     return unit * np.linalg.solve(scaled + _DAMPING * np.eye(len(unit)), unit * normal.right)
@@ -325,7 +329,7 @@ def _solved(normal: Normal) -> Float | None:
 
 def inverse(matrix: Float) -> Float | None:
     """Invert a symmetric matrix with unit diagonal scaling; return None if it is singular."""
-    if (unit_scaled := _unit_scaled(matrix)) is None:
+    if (unit_scaled := _scale_to_unit(matrix)) is None:
         return None
     scaled, unit = unit_scaled
     if np.linalg.eigvalsh(scaled)[0] < 1e-12:
@@ -333,7 +337,7 @@ def inverse(matrix: Float) -> Float | None:
     return np.asarray(np.linalg.inv(scaled) * unit[:, None] * unit[None, :])
 
 
-def _unit_scaled(matrix: Float) -> tuple[Float, Float] | None:
+def _scale_to_unit(matrix: Float) -> tuple[Float, Float] | None:
     """Return D·M·D with a diagonal of ones, and the diagonal of D; None if an unknown is undetermined."""
     diagonal = np.diag(matrix)
     if not (np.isfinite(matrix).all() and (diagonal > 0).all()):

@@ -147,26 +147,26 @@ def loaded(cameras: Cameras, index: int, config: RegisterConfig, background: Seq
     everywhere = np.ones(image.shape[:2], bool) if mask is None else mask
     image[~everywhere] = 0.5
     planes = np.stack([grey_of(image), everywhere], 2).astype(np.float32)
-    levels = [_shrunk(one, planes, sizes[-1])]
+    levels = [_shrink(one, planes, sizes[-1])]
     for side in reversed(sizes[:-1]):  # each level from the previous one, which is fastest
-        levels.insert(0, _shrunk(one, levels[0][1], side))
-    pyramid = [(camera, level_of(_grey(planes), planes[..., 1] > 0.999)) for camera, planes in levels]
+        levels.insert(0, _shrink(one, levels[0][1], side))
+    pyramid = [(camera, level_of(_take_grey(planes), planes[..., 1] > 0.999)) for camera, planes in levels]
     finest = levels[-1][1]
-    camera, small = _shrunk(one, finest, config.pool_size)
-    return Photo(one[0], image, everywhere, pyramid, (camera, _grey(small)), _grey(finest))
+    camera, small = _shrink(one, finest, config.pool_size)
+    return Photo(one[0], image, everywhere, pyramid, (camera, _take_grey(small)), _take_grey(finest))
 
 
-def _shrunk(one: Cameras, planes: NDArray[np.float32], side: int) -> tuple[Camera, NDArray[np.float32]]:
+def _shrink(one: Cameras, planes: NDArray[np.float32], side: int) -> tuple[Camera, NDArray[np.float32]]:
     """Shrink (H, W, 2) planes, grey and the valid share of each pixel, to a longer side."""
     camera = one.resized(side)[0]
     return camera, resize(planes, (camera.width, camera.height))
 
 
-def _grey(planes: NDArray[np.float32]) -> Float:
+def _take_grey(planes: NDArray[np.float32]) -> Float:
     return planes[..., 0].astype(np.float64)
 
 
-def _apart(a: Aligned, b: Aligned) -> bool:
+def _are_apart(a: Aligned, b: Aligned) -> bool:
     distance, angle = pose_error(a.viewmat, b.viewmat)
     return distance > _APART[0] * b.depth or angle > _APART[1]
 
@@ -188,7 +188,9 @@ class Search:
     def by_alignment(self, start: Start, photo: Photo) -> Candidate | None:
         """Align directly, coarse to fine; return None if the start does not see the scene."""
         aligned = self._aligned(start.begins, photo.pyramid)
-        return None if aligned is None else Candidate(start, aligned, self._likeness(aligned, photo))
+        if aligned is None:
+            return None
+        return Candidate(start, aligned, self._likeness(aligned, photo))
 
     def by_features(self, start: Start, photo: Photo) -> Candidate | None:
         """Match, solve PnP and refine; return None without a matcher or with too few inliers."""
@@ -206,7 +208,9 @@ class Search:
             self.renderer, pose, photo.camera, photo.image, photo.mask, self.match, self.config, passes
         )
         self.renders += passes if solved is None else solved.passes
-        return solved if solved is not None and solved.inliers >= self.config.min_inliers else None
+        if solved is not None and solved.inliers >= self.config.min_inliers:
+            return solved
+        return None
 
     def against_repeats(self, best: Candidate, photo: Photo) -> tuple[Candidate, list[Float]]:
         """Compare a pose with those at which the scene looks alike.
@@ -240,7 +244,7 @@ class Search:
             if found is None:
                 continue
             candidate = Candidate(best.start, found, self._likeness(found, photo))
-            fresh = all(_apart(found, other.found) for other in aligned)
+            fresh = all(_are_apart(found, other.found) for other in aligned)
             if fresh and candidate.zncc >= best.zncc - _LIKENESS_LOSS:
                 aligned.append(candidate)
         if len(aligned) < 2:
@@ -263,7 +267,7 @@ class Search:
             return best, alike, False
         chosen = aligned[first]
         refined = self.by_features(replace(best.start, begins=chosen.found.viewmat), photo)
-        if refined is not None and not _apart(refined.found, chosen.found):
+        if refined is not None and not _are_apart(refined.found, chosen.found):
             chosen = refined
         return chosen, alike, True
 

@@ -49,7 +49,7 @@ def matcher_named(name: str, ratio: float, most: int) -> Matcher | None:
     Traceback (most recent call last):
     g2ard.errors.InputError: matcher: expected auto, sift, direct or MODULE:FUNCTION, got 'some'
     """
-    absent = "" if name == "direct" else _unusable()
+    absent = "" if name == "direct" else _explain_unusable()
     if name == "direct" or (name == "auto" and absent):
         return None
     if name not in ("auto", "sift") and not all(name.partition(":")):
@@ -58,10 +58,10 @@ def matcher_named(name: str, ratio: float, most: int) -> Matcher | None:
         raise MissingDependencyError(
             f"poses from matches need pycolmap ({absent})", parameter="matcher", hint="pip install pycolmap"
         )
-    return Sift(ratio, most) if name in ("auto", "sift") else _plugged(name)
+    return Sift(ratio, most) if name in ("auto", "sift") else _load_plugin(name)
 
 
-def _unusable() -> str:
+def _explain_unusable() -> str:
     """Return why pycolmap is unavailable, or ""."""
     if sys.modules.get("pycolmap", ...) is None or find_spec("pycolmap") is None:
         where = (sys.platform, platform.machine())
@@ -70,11 +70,11 @@ def _unusable() -> str:
     try:
         importlib.import_module("pycolmap")
     except Exception as error:
-        return f"pycolmap is installed but cannot be imported: {_told(error)}"
+        return f"pycolmap is installed but cannot be imported: {_describe(error)}"
     return ""
 
 
-def _plugged(name: str) -> Matcher:
+def _load_plugin(name: str) -> Matcher:
     """Load a user's function, also from modules in the working directory."""
     module, _, function = name.partition(":")
     path = list(sys.path)
@@ -82,7 +82,7 @@ def _plugged(name: str) -> Matcher:
     try:
         available = getattr(importlib.import_module(module), function, None)
     except Exception as error:
-        raise InputError(f"matcher {name}: cannot import {module}: {_told(error)}") from error
+        raise InputError(f"matcher {name}: cannot import {module}: {_describe(error)}") from error
     finally:
         sys.path[:] = path
     if not callable(available):
@@ -92,13 +92,13 @@ def _plugged(name: str) -> Matcher:
         try:
             pairs = available(photo, render)
         except (Exception, SystemExit) as error:
-            raise InputError(f"matcher {name}: {_told(error)}") from error
+            raise InputError(f"matcher {name}: {_describe(error)}") from error
         return checked_pairs(f"matcher {name}", pairs, photo.shape, render.shape)
 
     return match
 
 
-def _told(error: BaseException) -> str:
+def _describe(error: BaseException) -> str:
     return " ".join(f"{type(error).__name__}: {error}".split())
 
 
@@ -180,7 +180,7 @@ class Sift:
 
 def sift_or_none(ratio: float, most: int) -> Sift | None:
     """Return SIFT if it is available."""
-    return None if _unusable() else Sift(ratio, most)
+    return None if _explain_unusable() else Sift(ratio, most)
 
 
 def mutual(

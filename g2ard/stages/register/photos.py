@@ -65,7 +65,7 @@ def register(
     if not len(photos):
         raise InputError("no photos to register")
     require("keep", repr(keep), keep in KEPT, ", ".join(KEPT))
-    given = _poses(starts, photos)
+    given = _check_poses(starts, photos)
     if not given and pool is None:
         raise InputError("no photo has a starting pose; pass starting poses or a pool", parameter="starts")
     renderer = Renderer(scene, background=background)
@@ -84,7 +84,7 @@ def register(
         if best is not None and best.solved is not None:
             matches[name] = np.concatenate([best.solved.pixels, best.solved.seen], 1)
         if best is None and keep == "all" and start is not None:
-            row = replace(row, camera_from_world=_rows(start.pose))
+            row = replace(row, camera_from_world=_list_rows(start.pose))
         rows.append(replace(row, seconds=time.perf_counter() - began))
         if row.camera_from_world is not None and row.status in KEPT[keep]:
             kept.append(i)
@@ -99,11 +99,11 @@ def register(
     return Registered(cameras, RegisterReport(tuple(rows)), matches)
 
 
-def _rows(matrix: Float) -> tuple[tuple[float, ...], ...]:
+def _list_rows(matrix: Float) -> tuple[tuple[float, ...], ...]:
     return tuple(map(tuple, matrix.tolist()))
 
 
-def _poses(poses: Mapping[str, ArrayLike] | None, photos: Cameras) -> dict[str, Float]:
+def _check_poses(poses: Mapping[str, ArrayLike] | None, photos: Cameras) -> dict[str, Float]:
     out = {}
     for name in photos.names:
         if poses and name in poses:
@@ -133,10 +133,10 @@ def _register_photo(
         return replace(refused, reason=str(error)), None
     search.renders = 0
     if given is not None:
-        candidates = _from_pose(search, given, photo)
+        candidates = _start_from_pose(search, given, photo)
     else:
         assert pool is not None
-        candidates = _from_pool(search, pool, photo)
+        candidates = _start_from_pool(search, pool, photo)
     if not candidates:
         least = f"{search.config.min_overlap:.0%} of the photo"
         why = f"away from edges, the scene covers less than {least} at the starting pose"
@@ -147,10 +147,10 @@ def _register_photo(
     alike: list[Float] = []
     if search.config.fallback and best.zncc >= min(search.config.doubt, search.config.accept):
         best, alike = search.against_repeats(best, photo)
-    return _reported(name, best, search.config, search.renders, photos[index].K[0, 0], alike), best
+    return _report(name, best, search.config, search.renders, photos[index].K[0, 0], alike), best
 
 
-def _from_pose(search: Search, given: Start, photo: Photo) -> list[Candidate]:
+def _start_from_pose(search: Search, given: Start, photo: Photo) -> list[Candidate]:
     """Try features, then alignment, then alignment from a rotated start, then features from the result."""
     config = search.config
 
@@ -168,10 +168,10 @@ def _from_pose(search: Search, given: Start, photo: Photo) -> list[Candidate]:
         search.renders += 1
         if shift and (c := search.by_alignment(replace(given, begins=pose), photo)):
             aligned.append(c)
-    return out + aligned + _featured(search, aligned, photo)
+    return out + aligned + _try_features(search, aligned, photo)
 
 
-def _from_pool(search: Search, pool: PoolRenders, photo: Photo) -> list[Candidate]:
+def _start_from_pool(search: Search, pool: PoolRenders, photo: Photo) -> list[Candidate]:
     """Try features from the pose with the most inliers, otherwise alignment from each similar pose."""
     order, renders = pool.ranked(*photo.small)
     search.renders += renders
@@ -187,10 +187,10 @@ def _from_pool(search: Search, pool: PoolRenders, photo: Photo) -> list[Candidat
     if not search.config.fallback:
         return []
     aligned = [c for start in starts if (c := search.by_alignment(start, photo))]
-    return aligned + _featured(search, aligned, photo)
+    return aligned + _try_features(search, aligned, photo)
 
 
-def _featured(search: Search, aligned: list[Candidate], photo: Photo) -> list[Candidate]:
+def _try_features(search: Search, aligned: list[Candidate], photo: Photo) -> list[Candidate]:
     """Try features from the most similar aligned pose, unless its status would be refused."""
     best = max(aligned, key=lambda c: c.zncc, default=None)
     if best is None or best.zncc < min(search.config.doubt, search.config.accept):
@@ -199,7 +199,7 @@ def _featured(search: Search, aligned: list[Candidate], photo: Photo) -> list[Ca
     return [candidate] if candidate else []
 
 
-def _reported(
+def _report(
     name: str, best: Candidate, config: RegisterConfig, renders: int, focal: float, alike: list[Float]
 ) -> PhotoReport:
     estimate = best.found
@@ -208,13 +208,13 @@ def _reported(
     prior = best.solved.focal_sigma if best.solved else config.focal_sigma
     if estimate.covariance is not None:
         motions = [motion_between(estimate.viewmat, other) for other in alike]
-        covariance = _with_tail(estimate.covariance, prior)[:6, :6] + sum(np.outer(m, m) for m in motions) / (
+        covariance = _add_tail(estimate.covariance, prior)[:6, :6] + sum(np.outer(m, m) for m in motions) / (
             1 + len(motions)
         )
         position = np.sqrt(np.trace(covariance[:3, :3]))
         rotation = np.sqrt(np.trace(covariance[3:6, 3:6]))
         sigma = PoseError(float(position), float(np.degrees(rotation)))
-    status, reason = _acceptance(best.zncc, sigma, estimate.depth, config)
+    status, reason = _judge(best.zncc, sigma, estimate.depth, config)
     if alike and status != "refused":
         away = min(pose_error(estimate.viewmat, other)[0] for other in alike)
         status = "uncertain"
@@ -232,16 +232,16 @@ def _reported(
         gain=estimate.gain,
         bias=estimate.bias,
         overlap=estimate.overlap,
-        covariance=None if covariance is None else _rows(covariance),
+        covariance=None if covariance is None else _list_rows(covariance),
         focal=float(focal * estimate.zoom),
         focal_sigma=None if estimate.covariance is None else float(estimate.covariance[6, 6]) ** 0.5,
         sigma=sigma,
         renders=renders,
-        camera_from_world=_rows(estimate.viewmat),
+        camera_from_world=_list_rows(estimate.viewmat),
     )
 
 
-def _with_tail(covariance: Float, prior: float) -> Float:
+def _add_tail(covariance: Float, prior: float) -> Float:
     """Return the covariance of an estimate with `prior` as σ of log f, which varies by `TAIL` times that.
 
     C = (Λ + eeᵀ/s²)⁻¹ becomes C (Λ + eeᵀ TAIL²/s²) C, where e is the axis of φ.
@@ -249,7 +249,7 @@ def _with_tail(covariance: Float, prior: float) -> Float:
     return covariance + np.outer(covariance[6], covariance[6]) * (TAIL**2 - 1) / prior**2
 
 
-def _acceptance(
+def _judge(
     zncc: float, sigma: PoseError | None, depth: float, config: RegisterConfig
 ) -> tuple[Status, str | None]:
     """Return the status of a pose and the reason, None if it is registered."""

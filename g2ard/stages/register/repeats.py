@@ -109,11 +109,11 @@ def repeated_poses(renderer: Renderer, camera: Camera, sift: Sift, config: Regis
     poses = []
     depth = float(np.median(points @ camera.viewmat[2, :3] + camera.viewmat[2, 3]))
     offsets = points[j] - points[i]
-    for one in _common(offsets / (_CELL[1] * depth), least, _MOST_PEAKS[0]):
+    for one in _find_common(offsets / (_CELL[1] * depth), least, _MOST_PEAKS[0]):
         back = np.eye(4)
         back[:3, 3] = -np.median(offsets[one], 0)
         poses.append(camera.viewmat @ back)
-    for one in _common((places[j] - places[i]) / (_CELL[0] * side), least, _MOST_PEAKS[1]):
+    for one in _find_common((places[j] - places[i]) / (_CELL[0] * side), least, _MOST_PEAKS[1]):
         few = one[:: 1 + len(one) // _MOST_MATCHES]
         answer = solve_pnp(camera, places[i[few]], points[j[few]], config)
         if answer is not None and answer[1].sum() >= _LEAST_SUPPORT[0]:
@@ -128,7 +128,7 @@ def repeated_poses(renderer: Renderer, camera: Camera, sift: Sift, config: Regis
     return found[:_MOST_REPEATS]
 
 
-def _common(steps: Float, least: int, most: int) -> Iterator[NDArray[np.intp]]:
+def _find_common(steps: Float, least: int, most: int) -> Iterator[NDArray[np.intp]]:
     """Yield indices of the (M, D) displacements, in cells, around each of the `most` most common ones."""
     if len(steps) < least:
         return

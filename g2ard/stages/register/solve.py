@@ -86,7 +86,7 @@ def solve(
             there = zoomed(camera, solution.zoom, solution.viewmat)
         out = renderer.render(there, median=True)
         uv, seen = match(photo, np.clip(out.image, 0, 1))
-        counts = _at(mask, uv)
+        counts = _look_up(mask, uv)
         uv = uv[counts]
         seen = seen[counts]
         points, known = lifted(out, there, seen, config)
@@ -100,9 +100,9 @@ def solve(
         found, prior, data, alone = with_focal(zoomed(there, 1.0, T), camera.K[0, 0], of, X, config)
         T = found.viewmat
         K = found.K
-        shift = _projected(T, K, X) - _projected(there.viewmat, there.K, X)
+        shift = _project(T, K, X) - _project(there.viewmat, there.K, X)
         cells = np.floor(4 * of / [camera.width, camera.height]).clip(0, 3) @ [1, 4]
-        distance = np.linalg.norm(_projected(T, K, X) - of, axis=1)
+        distance = np.linalg.norm(_project(T, K, X) - of, axis=1)
         solution = Solved(
             viewmat=T,
             matches=int(known.sum()),
@@ -123,7 +123,7 @@ def solve(
     return solution
 
 
-def _at(image: NDArray[np.bool_], uv: Float) -> NDArray[np.bool_]:
+def _look_up(image: NDArray[np.bool_], uv: Float) -> NDArray[np.bool_]:
     height, width = image.shape
     column, row = np.floor(uv).astype(int).T
     return image[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)]
@@ -188,7 +188,9 @@ def solve_pnp(
     U, _, Vt = np.linalg.svd(T[:3, :3])
     T[:3, :3] = U @ Vt
     T[:3, 3] -= T[:3, :3] @ middle
-    return (T, np.asarray(answer["inlier_mask"], bool)) if np.isfinite(T).all() else None
+    if np.isfinite(T).all():
+        return (T, np.asarray(answer["inlier_mask"], bool))
+    return None
 
 
 def with_focal(
@@ -221,7 +223,7 @@ def with_focal(
         if wider == prior:
             break
         prior = wider
-    before, after = (np.median(np.abs(_projected(c.viewmat, c.K, points) - uv)) for c in (camera, here))
+    before, after = (np.median(np.abs(_project(c.viewmat, c.K, points) - uv)) for c in (camera, here))
     if not after < before + config.max_reprojection:  # diverged
         return (
             camera,
@@ -245,7 +247,7 @@ def information(T: Float, K: Float, uv: Float, points: Float) -> tuple[Float, Fl
     none = np.zeros(len(X))
     right = np.stack([1 / depth, none, -x / depth, -x * y, 1 + x * x, -y, x]) * K[0, 0]
     down = np.stack([none, 1 / depth, -y / depth, -1 - y * y, x * y, x, y]) * K[1, 1]
-    residual = uv - _projected(T, K, points)
+    residual = uv - _project(T, K, points)
     sigma = max(_LEAST_MATCH_SIGMA, _SIGMA_OF_MAD * float(np.median(np.abs(residual))))
     weight = 1 / (1 + (residual**2).sum(1) / sigma**2)
     J = np.concatenate([right, down], 1)
@@ -253,7 +255,7 @@ def information(T: Float, K: Float, uv: Float, points: Float) -> tuple[Float, Fl
     return np.einsum("in,jn->ij", J * weights, J, optimize=False), (J * weights) @ residual.T.ravel()
 
 
-def _projected(T: Float, K: Float, points: Float) -> Float:
+def _project(T: Float, K: Float, points: Float) -> Float:
     """Project (M, 3) world points to (M, 2) pixels."""
     X = points @ T[:3, :3].T + T[:3, 3]
     return X[:, :2] / X[:, 2:] * [K[0, 0], K[1, 1]] + K[:2, 2]

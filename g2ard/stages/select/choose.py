@@ -112,7 +112,7 @@ def select(
         gains = poses.gains_of(order, alike, of_usable)
     if not len(order):
         raise InputError(unseeing(cameras, "a cell of the surface"))
-    count = _knee(gains) if k == "auto" else min(k, len(order))
+    count = _find_knee(gains) if k == "auto" else min(k, len(order))
     share = gains / total if (total := gains.sum()) > 0 else np.full(len(gains), 1 / len(gains))
     seconds["total"] = time.perf_counter() - began
     return Selection(
@@ -143,10 +143,10 @@ def _check(cameras: Cameras, k: int | Literal["auto"], policy: str) -> None:
         )
 
 
-def _knee(gains: Float) -> int:
+def _find_knee(gains: Float) -> int:
     """Return the count where cumulative gains lie farthest above their chord; all if straight.
 
-    >>> _knee(np.array([5.0, 4.0, 3.0, 0.1, 0.1, 0.1, 0.1])), _knee(np.array([1.0, 1.0, 1.0]))
+    >>> _find_knee(np.array([5.0, 4.0, 3.0, 0.1, 0.1, 0.1, 0.1])), _find_knee(np.array([1.0, 1.0, 1.0]))
     (3, 3)
     """
     total = gains.sum()

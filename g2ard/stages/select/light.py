@@ -64,7 +64,7 @@ def complete(
     renders = len(measured) + len(offered)
 
     def light(cameras: Cameras, first: int) -> NDArray[np.float32]:
-        return _light(
+        return _measure_light(
             scene, cameras, some, 1 / represents, lambda i: progress("coverage", first + i, renders)
         )
 
@@ -80,7 +80,7 @@ def complete(
     return order[:count].astype(np.int64), gains[:count] / len(some), unseen
 
 
-def _light(
+def _measure_light(
     scene: Splats, cameras: Cameras, rows: NDArray[np.int64], share: float, tell: Callable[[int], None]
 ) -> NDArray[np.float32]:
     """Return (C, R) min(share·A, 64)/16 for some rows."""

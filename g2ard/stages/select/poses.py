@@ -123,11 +123,11 @@ def pose_kernel(cameras: Cameras, depths: Float) -> Float:
     scale = np.where(depths > 0, depths, np.median(seen) if len(seen) else 1.0)
     positions = cameras.positions - np.median(cameras.positions, axis=0)  # robust to a single far pose
     with np.errstate(over="ignore", invalid="ignore"):  # squares of 1e300 overflow to infinity
-        away = np.nan_to_num(_squares(positions), nan=np.inf) / (scale[:, None] * scale)
-    return np.exp(-(away + _squares(cameras.forwards)) / _KERNEL_BANDWIDTH**2)
+        away = np.nan_to_num(_measure_squares(positions), nan=np.inf) / (scale[:, None] * scale)
+    return np.exp(-(away + _measure_squares(cameras.forwards)) / _KERNEL_BANDWIDTH**2)
 
 
-def _squares(rows: Float) -> Float:
+def _measure_squares(rows: Float) -> Float:
     """Return (n, n) squared distances, exactly 0 between equal rows."""
     out = np.zeros((len(rows), len(rows)))
     for column in rows.T:

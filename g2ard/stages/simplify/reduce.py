@@ -207,10 +207,10 @@ def simplify(
         dense = scene.with_sh_degree(0).take(scene.core.order)  # ties in depth go by row
         lost = opacity_lost(dense, splats_of(scene, out), views)
         progress("gaps", 1, 1)
-    return _simplified(splats, finite, out, lost)
+    return _finish(splats, finite, out, lost)
 
 
-def _simplified(
+def _finish(
     splats: Splats, finite: NDArray[np.bool_] | slice, out: dict[str, Any], lost: float | None
 ) -> Simplified:
     parents = np.full(len(splats), -1, np.int64)
@@ -231,18 +231,18 @@ def _simplified(
         clamped_opacities=out["clamped_opacities"],
         fitted=out.get("fitted", 0),
         unseen=out.get("unseen"),
-        faded=_faded(splats, small, parents),
+        faded=_count_faded(splats, small, parents),
         skipped={
             "alone": alone,
             "sh_bands": splats.sh_degree - math.isqrt(out["sh"].shape[1]) + 1,
-            **_spared(out["rounds"]),
+            **_count_spared(out["rounds"]),
         },
         opacity_lost=lost,
     )
     return Simplified(small, parents, protected, report)
 
 
-def _faded(splats: Splats, small: Splats, parents: NDArray[np.int64]) -> int:
+def _count_faded(splats: Splats, small: Splats, parents: NDArray[np.int64]) -> int:
     """Count merged rows too faint to draw although a member was drawn: distant floaters whose mass is spread
     too thin."""
     faint = small.logit_opacities < DRAWN_LOGIT
@@ -253,7 +253,7 @@ def _faded(splats: Splats, small: Splats, parents: NDArray[np.int64]) -> int:
     return int(np.count_nonzero(faint & drawn))
 
 
-def _spared(rounds: list[dict[str, Any]]) -> dict[str, int]:
+def _count_spared(rounds: list[dict[str, Any]]) -> dict[str, int]:
     """Count work that the paper's rounds skipped."""
     if not rounds or "cells" not in rounds[0]:
         return {}
