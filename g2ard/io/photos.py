@@ -214,12 +214,22 @@ def _resample(image: Float32, lens: PhotoLens, K: Float, size: Size) -> Float32:
     as the photo is finer, which are averaged."""
     height, width = image.shape[:2]
     times = _samples_per_side(lens, width, K)
-    pixels, _ = _look_up(lens, K, size, times)
-    u, v = (pixels * (np.array([width, height]) / lens.size) - 0.5).T
-    samples = _sample(image, u, v, around=lens.model == "EQUIRECTANGULAR")
-    return resize(samples.reshape(size[1] * times, size[0] * times, -1), size)
+    scale = np.array([width, height]) / lens.size
+    bands = []
+    for pixels in _bands(_look_up(lens, K, size, times)[0].reshape(size[1], -1, 2)):
+        u, v = (pixels.reshape(-1, 2) * scale - 0.5).T
+        samples = _sample(image, u, v, around=lens.model == "EQUIRECTANGULAR")
+        rows = len(pixels)
+        bands.append(resize(samples.reshape(rows * times, size[0] * times, -1), (size[0], rows)))
+    return np.concatenate(bands)
 
 
+def _bands(rows: Float) -> list[Float]:
+    """Split rows into bands that a processor's cache holds."""
+    return np.array_split(rows, min(_BANDS, len(rows)))
+
+
+_BANDS = 32
 _MOST_SAMPLES = 8
 
 
@@ -236,9 +246,14 @@ def _look_up(lens: PhotoLens, K: Float, size: Size, times: int) -> tuple[Float, 
 
 
 def _find_pixels(lens: PhotoLens, K: tuple[float, ...], size: Size, times: int) -> tuple[Float, Mask]:
-    v, u = (np.mgrid[0 : size[1] * times, 0 : size[0] * times] + 0.5) / times
-    rays = np.stack([u.ravel(), v.ravel(), np.ones(u.size)], 1) @ np.linalg.inv(np.array(K).reshape(3, 3)).T
-    return lens.project(rays)
+    turn = np.linalg.inv(np.array(K).reshape(3, 3)).T
+    across, down = ((np.arange(side * times) + 0.5) / times for side in size)
+    bands = []
+    for band in _bands(down):
+        u, v = (grid.ravel() for grid in np.meshgrid(across, band))
+        bands.append(lens.project(np.stack([u, v, np.ones(u.size)], 1) @ turn))
+    pixels, held = zip(*bands, strict=True)
+    return np.concatenate(pixels), np.concatenate(held)
 
 
 _lookup_of_view = lru_cache(maxsize=2)(_find_pixels)  # usually all photos share one lens

@@ -12,6 +12,9 @@ Float = NDArray[np.float64]
 
 _SINGLE_FOCAL = ("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "SIMPLE_FISHEYE")
 
+_PLANAR = ("FULL_OPENCV", "FOV")
+"""Models that distort the pinhole plane, not angles."""
+
 PARAMETERS = {
     "OPENCV_FISHEYE": 8,
     "FULL_OPENCV": 12,
@@ -84,17 +87,21 @@ class PhotoLens:
         """Map (N, 3) rays in the view's axes to (N, 2) pixels, and say which of them the photo holds."""
         x, y, z = np.array(self.turn).reshape(3, 3) @ rays.T
         across = np.hypot(x, y)
-        angle = np.arctan2(across, z)
         width, height = self.size
         if self.model == "EQUIRECTANGULAR":
             u = (np.arctan2(x, z) / (2 * np.pi) + 0.5) * width
             v = (np.arctan2(y, np.hypot(x, z)) / np.pi + 0.5) * height
             return np.stack([u, v], 1), np.ones(len(u), bool)
-        inside = angle < _find_end(self)
-        angle = np.where(inside, angle, 0.0)
-        away = self._plane_radius(angle)
-        aim = np.where(across > 0, across, 1.0)
-        u, v = self._bent(x / aim * away, y / aim * away)
+        if self.model in _PLANAR:
+            inside = across < np.tan(_find_end(self)) * z
+            ahead = np.where(inside, z, 1.0)
+            u, v = self._bent(np.where(inside, x / ahead, 0.0), np.where(inside, y / ahead, 0.0))
+        else:
+            angle = np.arctan2(across, z)
+            inside = angle < _find_end(self)
+            away = np.where(inside, angle, 0.0)
+            aim = np.where(across > 0, across, 1.0)
+            u, v = self._bent(x / aim * away, y / aim * away)
         cx, cy, _ = self._centre_and_rest
         u = self.focal[0] * u + cx
         v = self.focal[1] * v + cy
@@ -103,7 +110,7 @@ class PhotoLens:
 
     def _plane_radius(self, angle: Float) -> Float:
         """Return the radius before distortion: the angle of fisheyes, otherwise its tangent."""
-        return np.tan(angle) if self.model in ("FULL_OPENCV", "FOV") else angle
+        return np.tan(angle) if self.model in _PLANAR else angle
 
     def _bent(self, u: Float, v: Float) -> tuple[Float, Float]:
         _, _, rest = self._centre_and_rest
@@ -164,7 +171,7 @@ class PhotoLens:
 def _find_end(lens: PhotoLens) -> float:
     """Return the angle from the axis where a lens ends: its radius stops growing, or the corners of a
     photo that shows the whole image circle begin."""
-    planar = lens.model in ("FULL_OPENCV", "FOV")
+    planar = lens.model in _PLANAR
     angles = np.linspace(0, np.pi / 2 if planar else np.pi, 20001)[:-1]
     radii, _ = lens._bent(lens._plane_radius(angles), np.zeros(len(angles)))
     falls = np.flatnonzero(np.diff(radii) <= 0)
