@@ -5,6 +5,7 @@ tests that need one skip where there is none. It draws on the CPU (SwiftShader, 
 variables such as VK_DRIVER_FILES would hide) and finds no other host.
 """
 
+import atexit
 import base64
 import io
 import json
@@ -14,6 +15,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from functools import cache
 from pathlib import Path
 from typing import Any, Self
 
@@ -50,10 +52,10 @@ def chromium() -> str:
     return path
 
 
-class Browser:
-    """One page of `width` × `height` pixels."""
+class _Chromium:
+    """A process that all pages of the tests share: it starts in seconds, and keeps compiled shaders."""
 
-    def __init__(self, width: int, height: int) -> None:
+    def __init__(self) -> None:
         self._profile = tempfile.TemporaryDirectory(ignore_cleanup_errors=True)
         ours, theirs = os.pipe(), os.pipe()  # what it reads, what it writes
 
@@ -62,7 +64,7 @@ class Browser:
                 os.dup2(source, target)
 
         self._process = subprocess.Popen(
-            [chromium(), *_FLAGS, f"--user-data-dir={self._profile.name}", f"--window-size={width},{height}"],
+            [chromium(), *_FLAGS, f"--user-data-dir={self._profile.name}"],
             env={name: value for name, value in os.environ.items() if not name.startswith("VK_")},
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
@@ -72,39 +74,75 @@ class Browser:
         os.close(ours[0])
         os.close(theirs[1])
         self._to, self._from = ours[1], theirs[0]
-        self._rest, self._number, self._session = b"", 0, None
+        self._rest, self._number = b"", 0
+        atexit.register(self._end)
+
+    def _end(self) -> None:
+        self._process.kill()
+        self._process.wait()
+        self._profile.cleanup()
+
+    def write(self, method: str, parameters: dict[str, Any], session: str | None) -> int:
+        """Write a call and return its number."""
+        self._number += 1
+        call = {"id": self._number, "method": method, "params": parameters}
+        if session is not None:
+            call["sessionId"] = session
+        os.write(self._to, json.dumps(call).encode() + b"\0")
+        return self._number
+
+    def read(self, until: float) -> dict[str, Any]:
+        """Return the next message, of any page."""
+        import select
+
+        while b"\0" not in self._rest:
+            ready, _, _ = select.select([self._from], [], [], max(0, until - time.monotonic()))
+            assert ready, f"the browser has not answered for {_SECONDS} s"
+            piece = os.read(self._from, 1 << 20)
+            assert piece, "the browser has ended"
+            self._rest += piece
+        message, self._rest = self._rest.split(b"\0", 1)
+        return json.loads(message)
+
+
+_start = cache(_Chromium)
+
+
+class Browser:
+    """One page of `width` × `height` pixels, which shares no storage with others."""
+
+    def __init__(self, width: int, height: int) -> None:
+        self._chromium = _start()
+        self._session: str | None = None
         self.messages: list[str] = []
         self.requests: list[str] = []
-        target = self.send("Target.createTarget", url="about:blank")["targetId"]
+        self._context = self.send("Target.createBrowserContext")["browserContextId"]
+        where = {"browserContextId": self._context, "width": width, "height": height}
+        target = self.send("Target.createTarget", url="about:blank", **where)["targetId"]
         self._session = self.send("Target.attachToTarget", targetId=target, flatten=True)["sessionId"]
         for domain in ("Page", "Runtime", "Network"):
             self.send(f"{domain}.enable")
+        self.send("Emulation.setFocusEmulationEnabled", enabled=True)
         self.resize(width, height)
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._process.kill()
-        self._process.wait()
-        os.close(self._to)
-        os.close(self._from)
-        self._profile.cleanup()
+        self._session = None
+        self.send("Target.disposeBrowserContext", browserContextId=self._context)
 
     def send(self, method: str, **parameters: Any) -> dict[str, Any]:
         """Call a method of the protocol; fail with the browser's error."""
-        self._number += 1
-        call = {"id": self._number, "method": method, "params": parameters}
-        if self._session is not None:
-            call["sessionId"] = self._session
-        os.write(self._to, json.dumps(call).encode() + b"\0")
+        number = self._chromium.write(method, parameters, self._session)
         until = time.monotonic() + _SECONDS
         while True:
-            answer = self._next(until)
-            if answer.get("id") == self._number:
+            answer = self._chromium.read(until)
+            if answer.get("id") == number:
                 assert "error" not in answer, f"{method}: {answer['error']}"
                 return answer["result"]
-            self._note(answer)
+            if answer.get("sessionId") == self._session:
+                self._note(answer)
 
     def resize(self, width: int, height: int) -> None:
         size = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False}
@@ -133,18 +171,6 @@ class Browser:
         """Press the left button at a point, move, and let go at another."""
         for kind, (x, y) in (("mousePressed", start), ("mouseMoved", end), ("mouseReleased", end)):
             self.send("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", buttons=1, clickCount=1)
-
-    def _next(self, until: float) -> dict[str, Any]:
-        import select
-
-        while b"\0" not in self._rest:
-            ready, _, _ = select.select([self._from], [], [], max(0, until - time.monotonic()))
-            assert ready, f"the browser has not answered for {_SECONDS} s: {self.messages[-5:]}"
-            piece = os.read(self._from, 1 << 20)
-            assert piece, f"the browser has ended: {self.messages[-5:]}"
-            self._rest += piece
-        message, self._rest = self._rest.split(b"\0", 1)
-        return json.loads(message)
 
     def _note(self, event: dict[str, Any]) -> None:
         found = event.get("params", {})
