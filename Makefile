@@ -51,7 +51,7 @@ printed: setup
 stress: setup
 	$(BIN)/python tests/stress/run.py
 
-# Mutated files for every reader, FUZZ_RUNS of each of the corpus; a slice of them is in `make test`.
+# Malformed files for every reader, and FUZZ_RUNS mutated ones; a slice of both is in `make test`.
 FUZZ_RUNS ?= 2000
 FUZZ_SEED ?= 1
 fuzz: setup

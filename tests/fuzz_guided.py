@@ -69,7 +69,7 @@ def run_case(what: str, seconds: int, seed: int) -> None:
 
     def one(data: bytes) -> None:
         path.write_bytes(packed(data))
-        found = answer(asked, folder)
+        found, _ = answer(asked, folder)
         if found not in ("read", "refused"):
             raise RuntimeError(found)
 

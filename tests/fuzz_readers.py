@@ -8,6 +8,7 @@ Files lie in memory where the system has a folder for that.
 A mutation changes, cuts or doubles stretches of bytes, writes extreme integers and floats over them, or
 changes numbers and words in text. Packed files are unpacked, mutated and packed again, so that the decoders
 behind zlib and zip see damage too. The first file of each kind that a reader answers otherwise is kept.
+Before, each case meets all files that break one rule (`helpers/malformations.py`).
 """
 
 import argparse
@@ -33,6 +34,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent))
 from g2ard.errors import InputError
 from g2ard.io import kind, read_cloud, read_view_set
 from g2ard.scene.cameras import LARGEST_IMAGE
+from helpers.malformations import malformed
 from helpers.opened import read_scene
 from helpers.reader_cases import MAKERS, READ
 
@@ -127,17 +129,46 @@ def read_checked(path: Path) -> str | None:
     return None
 
 
-def answer(path: Path, folder: Path) -> str:
-    """Return `read`, `refused` if one line names a file of `folder`, or what a reader did instead."""
+def answer(path: Path, folder: Path) -> tuple[str, str]:
+    """Return `read`, `refused` if one line names a file of `folder`, or what a reader did instead; and the
+    line."""
     try:
         line = read_checked(path)
     except Exception as error:
         at = traceback.extract_tb(error.__traceback__)[-1]
-        return f"{type(error).__name__} in {Path(at.filename).name}:{at.lineno}: {str(error)[:120]}"
+        return f"{type(error).__name__} in {Path(at.filename).name}:{at.lineno}: {str(error)[:120]}", ""
     if line is None:
-        return "read"
+        return "read", ""
     one_line = "\n" not in line and str(folder) in line
-    return "refused" if one_line else f"not one line that names the file: {line!r}"
+    return "refused" if one_line else f"not one line that names the file: {line!r}", line
+
+
+NAMED = ["transforms", "cameras.json", "views", "ns-export", "meta.json", "lod-meta.json"]
+"""Files of JSON: if a property becomes the word x, the error names the property, its holder or x."""
+
+
+def break_rules(what: str, make: Callable[[Path], Path], folder: Path, every: int = 1) -> Counter[str]:
+    """Read every n-th malformed version of one case: how many were read or refused, and what else came."""
+    path = make(folder)
+    content = path.read_bytes()
+    asked = folder / READ[what] if what in READ else path
+    files = {data: how for how, data in malformed(content) if data != content}
+    tally: Counter[str] = Counter()
+    for data, how in list(files.items())[::every]:
+        path.write_bytes(data)
+        found, line = answer(asked, folder)
+        name, is_word, _ = how.partition(" is 'x'")
+        if found == "refused" and is_word and what in NAMED and not _names(line, name, folder):
+            found = f"does not name {name}: {line}"
+        tally[found if found in ("read", "refused") else f"{how}: {found}"] += 1
+    return tally
+
+
+def _names(line: str, name: str, folder: Path) -> bool:
+    """Return whether an error names one of the keys of a property, or its value x."""
+    keys = [key.removesuffix("s") for key in name.split(".") if not key.isdigit()]
+    told = line.replace(str(folder), "")
+    return not keys or any(key in told for key in keys) or re.search(r"\bx\b", told) is not None
 
 
 def fuzz(
@@ -163,7 +194,7 @@ def fuzz(
             break
         data = repacked(content, rng)
         path.write_bytes(data)
-        found = answer(asked, folder)
+        found, _ = answer(asked, folder)
         if found not in ("read", "refused", *tally):
             kept = folder / f"broken_{len(tally)}_{path.name}"
             kept.write_bytes(data)
@@ -188,7 +219,8 @@ def main() -> None:
             continue
         folder = Path(tempfile.mkdtemp(prefix="g2ard-fuzz-", dir=memory if memory.is_dir() else None))
         start = time.process_time()
-        tally = fuzz(what, make, folder, runs, options.seed, options.seconds or float("inf"))
+        tally = break_rules(what, make, folder)
+        tally += fuzz(what, make, folder, runs, options.seed, options.seconds or float("inf"))
         rate = tally.total() / (time.process_time() - start)
         read, refused = tally.pop("read", 0), tally.pop("refused", 0)
         print(f"{what:28} read {read:9,}  refused {refused:9,}  {rate:6,.0f} a CPU second", flush=True)

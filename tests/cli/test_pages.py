@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ import g2ard
 from g2ard.config.choices import BLACK
 from g2ard.rendering.sky import BOTTOM, TOP
 from g2ard.viewer import page as viewer_page
-from helpers.calls import CALLS, write_inputs
+from helpers.calls import CALLS
 from helpers.commands import CommandLine, refused, succeeds
 from helpers.photos import photos_of
 from helpers.scenes import checkered_ball
@@ -73,10 +74,9 @@ PAGES: dict[str, tuple[str | None, list[str]]] = {
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory, command_line: CommandLine) -> Path:
+def made(inputs: Path, tmp_path_factory: pytest.TempPathFactory, command_line: CommandLine) -> Path:
     """Return a folder with all pages."""
-    folder = tmp_path_factory.mktemp("pages")
-    write_inputs(folder)
+    folder = shutil.copytree(inputs, tmp_path_factory.mktemp("pages") / "files")
     for command, _ in PAGES.values():
         if command is not None:
             succeeds(command_line, folder, *command.split())
@@ -204,12 +204,11 @@ CLOUD_COMMANDS = [
 
 
 @pytest.mark.parametrize("command", CLOUD_COMMANDS)
-def test_points_are_points(command: str, tmp_path: Path, command_line: CommandLine) -> None:
-    write_inputs(tmp_path)
-    (tmp_path / "cloud.ply").rename(tmp_path / "autumn.ply")
-    _, _, told = command_line(*command.split(), cwd=tmp_path)
-    for run in tmp_path.glob("run"):
-        told += succeeds(command_line, tmp_path, "info", run).out
+def test_points_are_points(command: str, work: Path, command_line: CommandLine) -> None:
+    (work / "cloud.ply").rename(work / "autumn.ply")
+    _, _, told = command_line(*command.split(), cwd=work)
+    for run in work.glob("run"):
+        told += succeeds(command_line, work, "info", run).out
         told += "".join(Text(page).text for page in run.glob("*.html"))
         following = re.findall(r"g2ard (\w+) scene\.ply", Text(run / "report.html").text)
         assert following == ["distill", "lod", *["adapt"] * ("photos" in command)]
@@ -229,9 +228,8 @@ LIFT_PAGES = {
 
 
 @pytest.fixture(scope="module")
-def lifted(tmp_path_factory: pytest.TempPathFactory, command_line: CommandLine) -> Path:
-    folder = tmp_path_factory.mktemp("lifted")
-    write_inputs(folder)
+def lifted(inputs: Path, tmp_path_factory: pytest.TempPathFactory, command_line: CommandLine) -> Path:
+    folder = shutil.copytree(inputs, tmp_path_factory.mktemp("lifted") / "files")
     succeeds(command_line, folder, "lift", "cloud.ply", "-o", "lifted.ply")
     return folder
 

@@ -223,8 +223,12 @@ DISTILL: dict[str, Any] = {
 HANDED_ON = {"simplify.fold", "recover.ssim_weight", "recover.regularizers.anchor", "recover.schedule.reach"}
 FEW = {name: value for name, value in DISTILL.items() if name.startswith("select.") or name in HANDED_ON}
 """Settings that a whole distillation is tried with: stages get theirs as one object, so few tell for all."""
-IN_TILES = FEW | {name: DISTILL[name] for name in ("recover.background", "recover.sh_degree")}
-"""Settings that a distillation in tiles is tried with: two more, because tiles draw its targets."""
+_REACHING_TILES = "simplify.fold recover.background recover.sh_degree select.policy select.views_count"
+IN_TILES = {name: DISTILL[name] for name in _REACHING_TILES.split()}
+"""Settings that a distillation in tiles is tried with: one of each stage, and what its targets depend on."""
+_OF_TILES = "retention fold min_opacity morton_premerge_ratio dilation keep_region protection"
+OF_TILES = {name: SIMPLIFY[name] for name in _OF_TILES.split()}
+"""Settings that a simplification in tiles is tried with: it takes the same object as one in memory."""
 UNEVEN = ViewSet(VIEWS, splits=("train",) * 7 + ("test",), weights=np.arange(8.0) ** 2)
 BUDGET = 80
 
@@ -264,7 +268,7 @@ RUNS: dict[str, tuple[Callable[[Mapping[str, Any]], object], dict[str, Any]]] = 
     **{method: (_simplified(method, views=VIEWS), SIMPLIFY) for method in ("default", "fast")},
     **{f"{method} blind": (_simplified(method, blind=True), SIMPLIFY) for method in ("default", "fast")},
     "paper": (_simplified("paper"), SIMPLIFY),
-    "default in tiles": (_simplified_in_tiles, SIMPLIFY),
+    "default in tiles": (_simplified_in_tiles, OF_TILES),
     **{f"recover {kind}": (_recovered, RECOVER) for kind in PRIORS},
     **{policy: (_selected(policy), SELECT) for policy in POLICIES},
     "lift": (_lifted, LIFT),

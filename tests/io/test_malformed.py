@@ -12,42 +12,25 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fuzz_readers import fuzz, read_checked
+from fuzz_readers import break_rules, fuzz, read_checked
 from g2ard.io import kind, read_view_set
 from helpers.faults import Fault, faulty
 from helpers.glb_files import glb_parts, write_glb
-from helpers.malformations import malformed
 from helpers.opened import read_scene
 from helpers.project import ROOT
 from helpers.reader_cases import MAKERS, READ
 from helpers.view_files import orbit, transforms
 
-NAMED = ["transforms", "cameras.json", "views", "ns-export", "meta.json", "lod-meta.json"]
-"""Files of JSON: if a property becomes the word x, the error names the property, its holder or x."""
+SAMPLED = 5
+"""Of so many malformed files one is read here, and all in `make fuzz`. No rule breaks 5, 10 or 15 things."""
 
 
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("what", MAKERS)
 def test_malformed_files_end_in_one_line_that_names_them(tmp_path: Path, what: str) -> None:
-    path = MAKERS[what](tmp_path)
-    asked = tmp_path / READ[what] if what in READ else path
-    content = path.read_bytes()
-    files = {data: how for how, data in malformed(content) if data != content}
-    refused = 0
-    for data, how in files.items():
-        path.write_bytes(data)
-        try:
-            line = read_checked(asked)
-        except Exception as error:
-            raise AssertionError(f"{how}: {error!r}") from error
-        refused += line is not None
-        assert line is None or ("\n" not in line and str(tmp_path) in line), how
-        name, is_word, _ = how.partition(" is 'x'")
-        keys = [key.removesuffix("s") for key in name.split(".") if not key.isdigit()]
-        if line is not None and is_word and keys and what in NAMED:
-            told = line.replace(str(tmp_path), "")
-            assert any(key in told for key in keys) or re.search(r"\bx\b", told), f"{how}: {line}"
-    assert refused >= 40, f"{refused} of {len(files)}"
+    tally = break_rules(what, MAKERS[what], tmp_path, SAMPLED)
+    assert set(tally) <= {"read", "refused"}, tally
+    assert tally["refused"] >= 8, tally
 
 
 ABSENT = object()
