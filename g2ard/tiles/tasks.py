@@ -224,10 +224,8 @@ def far_around(store: TileStore, arguments: Arguments, inputs: Inputs) -> list[S
     return parts
 
 
-def cropped(
-    cameras: Cameras, core: PreparedScene, settings: RasterSettings, beside: int = _CROP_MARGIN
-) -> Cameras:
-    """Crop the cameras' images to a tile, with `beside` pixels around it."""
+def cropped(cameras: Cameras, core: PreparedScene, settings: RasterSettings) -> Cameras:
+    """Crop the cameras' images to a tile, with a margin around it."""
     points = core.means[core.core.order[:: max(1, len(core) // _CROP_SAMPLE)]].astype(np.float64)
     boxes = []
     for view, (viewmat, K) in enumerate(zip(cameras.viewmats, cameras.Ks, strict=True)):
@@ -238,8 +236,8 @@ def cropped(
             boxes.append((0, 0, 1, 1))
             continue
         u, v = K[:2, :2] @ np.stack([x[ahead], y[ahead]]) / z[ahead] + K[:2, 2:]
-        low = np.clip(np.floor([u.min(), v.min()]) - beside, 0, size - 1)
-        high = np.clip(np.ceil([u.max(), v.max()]) + beside, low + 1, size)
+        low = np.clip(np.floor([u.min(), v.min()]) - _CROP_MARGIN, 0, size - 1)
+        high = np.clip(np.ceil([u.max(), v.max()]) + _CROP_MARGIN, low + 1, size)
         boxes.append((*low, *high))
     corners = np.array(boxes, np.int64).reshape(-1, 2, 2)
     return cameras.cropped(corners[:, 0], corners[:, 1])
