@@ -68,6 +68,7 @@ class Stream(ABC, Generic[Block]):
     """
 
     _reading: tuple[tuple[Read, int], Iterator[Any]] | None = None
+    _is_copy = False
 
     def __init__(
         self,
@@ -92,6 +93,7 @@ class Stream(ABC, Generic[Block]):
     def __setstate__(self, state: dict[str, Any]) -> None:
         maps = {name: value for name, value in state.items() if isinstance(value, _Mapped)}
         vars(self).update(state | {n: np.memmap(m.file, m.dtype, "r", *m[2:]) for n, m in maps.items()})
+        self._is_copy = True
 
     def absolute(self) -> Self:
         """Return the source for a process that may run in another folder."""
@@ -123,7 +125,8 @@ class Stream(ABC, Generic[Block]):
                 raise InputError("was changed while it was read", path=self.path)
             yield block
             at = at + len(block) if kind == "positions" else first + sum(t.rows for t in self.tallies())
-        self._reading = ((kind, last), blocks) if last < self.count else None
+        if last < self.count and not self._is_copy:  # which would hold itself, and the file, in memory
+            self._reading = (kind, last), blocks
 
     def tallies(self) -> list[Tally]:
         """Return the counts over the rows that `blocks` has read, of each of its sources."""
