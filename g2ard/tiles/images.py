@@ -63,7 +63,8 @@ def draw(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
         One array per view, called by its number: (H, W, 3) uint16, see `rounded`, or with `opacity`
         (H, W, 4) float32, the image and its alpha.
     """
-    store, numbers = TileStore.open(places["store"]), arguments["views"]
+    store = TileStore.open(places["store"])
+    numbers = arguments["views"]
     cameras = cameras_of(inputs["views"]).take(numbers)
     settings = RasterSettings(near=arguments["near"], antialiased=store.render_model == "antialiased")
     canvases = [Canvas.blank(camera) for camera in cameras]
@@ -98,7 +99,8 @@ def reaching_into(store: TileStore, tile: int, cameras: Cameras, wide_files: Seq
     farthest = np.abs(cameras.positions[:, None] - corners).max(axis=1)
     pixel = float((np.linalg.norm(farthest, axis=1) / cameras.Ks[:, 0, 0]).max())
     reach = store.margin / 2 + _BLUR_PIXELS * pixel
-    parts, known = [store.read(tile)], {tile}
+    parts = [store.read(tile)]
+    known = {tile}
     if reach <= store.margin:
         parts.append(store.read_halo(tile))
     else:  # a pixel is wider than the margin, as in views from far away

@@ -62,7 +62,9 @@ class Merged:
         moved = [np.where(own < 0, -1, own + np.int64(n)) for own, n in zip(parents, before, strict=True)]
         if scene.identity() == [self.store.key]:
             return np.concatenate(moved)
-        out, done, begin = np.empty(self.store.count, np.int64), [0] * len(rows), 0
+        out = np.empty(self.store.count, np.int64)
+        done = [0] * len(rows)
+        begin = 0
         for block in scene.blocks(BLOCK):
             for tile, (core, _) in enumerate(self.store.tree.route(block.means)):
                 out[begin + core] = moved[tile][done[tile] : done[tile] + len(core)]
@@ -107,7 +109,8 @@ def simplify_tiles(
     else:
         merged, counts = _merged(run, budget, frame if sights is None else sights.frame, sights)
     if sights is None:
-        files, mean = [{"merged": path} for path in merged], None
+        files = [{"merged": path} for path in merged]
+        mean = None
     else:
         seen = sights.again(merged)
         files = [{"merged": one, "visibility": other} for one, other in zip(merged, seen, strict=True)]
@@ -129,7 +132,8 @@ def _report(
     run: TiledRun, counts: Sequence[int], merged: list[Path], *, seen: bool = False
 ) -> SimplifyReport:
     """Describe a merge; `merged` are the results of `merge`, none if nothing was merged."""
-    total, left = run.store.count, sum(counts)
+    total = run.store.count
+    left = sum(counts)
     kept = alone = clamped = unseen = 0
     for path in merged:
         members, limited = load(path, "members", "clamped")
@@ -214,7 +218,8 @@ def shares(sizes: Sequence[int], budget: int) -> list[int]:
     >>> shares([100, 200, 1], 30)
     [9, 20, 1]
     """
-    tiles, total = len(sizes), sum(sizes)
+    tiles = len(sizes)
+    total = sum(sizes)
     if budget < tiles:
         raise _unreached(tiles, budget, tiles, "one per tile")
     ends = [rows * (budget - tiles) // max(1, total - tiles) for rows in accumulate(n - 1 for n in sizes)]
@@ -227,7 +232,8 @@ def scene_in_tiles(
     """Return a scene whose Gaussians `tile` reads by the number of a tile of `store`."""
     parts = counts, tile, sh_degree, store.offset
     scene = PartsStream(Path(f"simplified-{key}"), *parts, [key], render_model=store.render_model)
-    scene.up, scene.axes = store.up, store.axes
+    scene.up = store.up
+    scene.axes = store.axes
     return scene
 
 
@@ -257,7 +263,8 @@ def _runs(run: TiledRun, costs: list[Path], budget: int) -> tuple[list[int], lis
     """
     kept = [len(load(path, "costs")[0]) + 1 for path in costs]
     if sum(kept) <= budget:
-        missing, faint = budget - sum(kept), []
+        missing = budget - sum(kept)
+        faint = []
         for size, drawn in zip(run.sizes, kept, strict=True):
             faint.append(min(missing, size - drawn))
             missing -= faint[-1]

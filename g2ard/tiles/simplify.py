@@ -216,7 +216,8 @@ def pair_plan(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
     """
     scene = tile_of(arguments, inputs, places)
     config = _config(arguments)
-    runs, last = arguments["runs"], arguments["last"]
+    runs = arguments["runs"]
+    last = arguments["last"]
     counts = config.rounds(runs, last)
     tile = _seen_tile(scene, arguments, inputs)
     of, a, b, costs = tile.plan(runs, counts, load(inputs["costs"], "costs")[0])
@@ -238,7 +239,8 @@ def merge(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
         number of rows that no view sees.
     """
     scene = tile_of(arguments, inputs, places)
-    runs, merges = arguments["runs"], arguments["merges"]
+    runs = arguments["runs"]
+    merges = arguments["merges"]
     of, a, b = load(inputs["plan"], "of", "a", "b")
     into = np.arange(runs)
     into[b[:merges]] = a[:merges]
@@ -268,8 +270,10 @@ def reduce(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
     Returns:
         What `merge` returns; also `protected`, (n,) bool.
     """
-    scene, config = tile_of(arguments, inputs, places), SimplifyConfig(**arguments["method"])
-    seen, final = _visibility(inputs), arguments["final"]
+    scene = tile_of(arguments, inputs, places)
+    config = SimplifyConfig(**arguments["method"])
+    seen = _visibility(inputs)
+    final = arguments["final"]
     done = simplify(
         scene, arguments["count"], config=config, visibility=seen, final_budget=final, progress=telling
     )
@@ -378,7 +382,8 @@ class TiledRun:
     """
 
     def __init__(self, store: TileStore, workers: Workers, config: SimplifyConfig):
-        self.store, self.workers = store, workers
+        self.store = store
+        self.workers = workers
         workers.folder.mkdir(parents=True, exist_ok=True)
         model = store.render_model
         self.method = config

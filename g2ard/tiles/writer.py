@@ -178,7 +178,8 @@ class Pouring:
         """Plan the tiles; check that the disk has room."""
         if self.mended is not None:
             return self._save_tree(self.mended[0].tree, self.mended[0].margin)
-        points, each = np.empty((0, 3), np.float32), 1.0
+        points = np.empty((0, 3), np.float32)
+        each = 1.0
         if self.stream.count > self.tile_rows:
             points, each = self._sample()
         tree = cut_tree(points, each, self.tile_rows)
@@ -273,7 +274,8 @@ class Pouring:
         some = None if self.mended is None else self.mended[1]
         written = self._run_each("gathered", "write", some, files, {}, {}, {"folder": self.folder})
         bounds = np.array([load(path, "bounds")[0] for path in written])
-        low, high = bounds[:, 0].min(axis=0), bounds[:, 1].max(axis=0)
+        low = bounds[:, 0].min(axis=0)
+        high = bounds[:, 1].max(axis=0)
         boxes = _load_tree(tree)[0].boxes()
         tiles = []
         for path, box in zip(written, boxes if some is None else boxes[some], strict=True):
@@ -379,7 +381,8 @@ def cut(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
     Returns:
         What `_route` returns; `tallies`, the counts of each source.
     """
-    stream, blocks = places["stream"], list[NDArray[Any]]()
+    stream = places["stream"]
+    blocks = list[NDArray[Any]]()
     for block in stream.part("blocks", *arguments["part"]):
         if isinstance(stream, PointStream):
             far, colors = block
@@ -399,7 +402,8 @@ def _route(rows: NDArray[Any], file: Path, only: Sequence[int] | None) -> Arrays
     `counts`, (tiles, 2), has their numbers.
     """
     tree, margin = _load_tree(file)
-    made, counts = Arrays(), np.zeros((tree.leaves, 2), np.int64)
+    made = Arrays()
+    counts = np.zeros((tree.leaves, 2), np.int64)
     for tile, chosen in enumerate(tree.route(_get_positions(rows), margin)):
         if only is not None and tile not in only:
             continue
@@ -443,9 +447,12 @@ def gathered(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
     Returns:
         `rows` and `checks` (CRC-32) of both files; `bounds`, (2, 3) of the tile's positions.
     """
-    tile, folder = arguments["tile"], places["folder"]
-    counts, checks = [0, 0], [0, 0]
-    low, high = np.full(3, np.inf), np.full(3, -np.inf)
+    tile = arguments["tile"]
+    folder = places["folder"]
+    counts = [0, 0]
+    checks = [0, 0]
+    low = np.full(3, np.inf)
+    high = np.full(3, -np.inf)
     for kind, (which, name) in enumerate((("core", tile_name(tile)), ("halo", halo_name(tile)))):
         with atomic_output(folder / PARTS / name, overwrite=True) as temporary, temporary.open("wb") as file:
             for path in inputs[which]:
@@ -455,6 +462,7 @@ def gathered(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
                 counts[kind] += len(rows)
                 if which == "core":
                     means = _get_positions(rows).astype(np.float64)
-                    low, high = np.minimum(low, means.min(axis=0)), np.maximum(high, means.max(axis=0))
+                    low = np.minimum(low, means.min(axis=0))
+                    high = np.maximum(high, means.max(axis=0))
         os.replace(folder / PARTS / name, folder / name)
     return {"rows": np.array(counts), "checks": np.array(checks), "bounds": np.stack([low, high])}

@@ -41,7 +41,8 @@ def poses(
     from g2ard.poses import plan_pool
 
     run.claim_views(output, format)
-    width, height = 800, 600
+    width = 800
+    height = 600
     if size is not None:
         width = size[0]
         height = size[1] if len(size) > 1 else max(1, round(0.75 * width))
