@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import shlex
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from functools import partial
@@ -42,7 +42,8 @@ from g2ard.scene.splats import Splats
 from g2ard.viewer.page import write_page
 
 if TYPE_CHECKING:
-    from g2ard.jobs.distill import DistillJob, RunTargets
+    from g2ard.jobs.distill_job import DistillJob
+    from g2ard.jobs.teaching import RunTargets
     from g2ard.pipeline.distill import Distilled
     from g2ard.report.distilled import Drawn
     from g2ard.report.run import RunReport
@@ -191,14 +192,18 @@ class RunFolder:
         write_views(self._scored, scored, splits=["test"] * len(scored), overwrite=True)
 
     def write_pages(
-        self, source: Source | Path, job: Any, done: Any, report: RunReport, told: Sequence[str], drawn: Drawn
+        self,
+        source: Source | Path,
+        job: DistillJob,
+        done: Distilled,
+        report: RunReport,
+        drawn: Drawn,
     ) -> tuple[RunReport, str]:
         """Write preview.png, with --page view.html, and report.html; return the report with the size of that
         page, and a line about it.
 
         Args:
             source: what was distilled.
-            told: the summary that the command prints.
             drawn: the views to show, and pictures of them.
         """
         from g2ard.report.distilled import (
@@ -242,7 +247,7 @@ class RunFolder:
             files = {text: name for text, name in files.items() if (self.path / name).exists()}
             command = shlex.join(["g2ard", *sys.argv[1:]])
             more: Any = {"best": shown[0], "on_white": on_white, "command": command, "files": files}
-            write_distill_report(page, title, renderers, drawn, report, told, **more)
+            write_distill_report(page, title, renderers, drawn, report, **more)
         return report, line
 
     def write_report(self, report: Report) -> None:

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import asdict
-from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from g2ard.cli.run import Run
 from g2ard.io.scene_formats import SUFFIXES, scene_format, written_bytes
@@ -13,28 +12,25 @@ from g2ard.progress import plural
 
 if TYPE_CHECKING:
     from g2ard.cli.run_folder import RunFolder
+    from g2ard.io.stream import PartsStream
     from g2ard.jobs.budget import Budget
     from g2ard.jobs.budget_search import ResolvedBudget
     from g2ard.jobs.cost import Cost
+    from g2ard.jobs.distill_job import DistillJob
     from g2ard.jobs.memory import TilePlan
-    from g2ard.report.run import KindScore, RunReport, ViewsReport
+    from g2ard.pipeline.distill import Distilled
+    from g2ard.report.run import RunReport, ViewsReport
     from g2ard.scene.splats import Splats
-
-_REPORTED_PSNR_LOSS = 0.05
-"""Loss against the simplified scene that is reported, in dB."""
-
-_REPORTED_SSIM_LOSS = 0.001
-"""Loss of SSIM against the simplified scene that is reported."""
-
-_HARMFUL_SIZE = 3.0
-"""Loss in dB at the views' own size, against that of training, above which --size is warned of."""
-
-_LEAST_REPORTED_SHARE = 0.005
-"""Share of the scene too small to report."""
 
 
 def tell_run(
-    run: Run, source: Path, job: Any, done: Any, report: RunReport, folder: RunFolder, page: str
+    run: Run,
+    source: Path,
+    job: DistillJob,
+    done: Distilled,
+    report: RunReport,
+    folder: RunFolder,
+    page: str,
 ) -> None:
     """Print the summary of a run and write its result.
 
@@ -42,9 +38,9 @@ def tell_run(
         source: what was distilled.
         page: line about the page.
     """
-    from g2ard.report.run import COLUMNS, describe_sizes, list_rows
+    from g2ard.report.run import COLUMNS, describe_sizes, list_remarks, list_rows
 
-    run.say(summarize_counts(report))
+    run.say(report.counts)
     title = f"held-out views against {report.against}, {describe_sizes(report)}, {report.stages}:"
     run.console.table(title, list(COLUMNS), list_rows(report))
     for line in list_remarks(report, verbose=run.verbose):
@@ -82,85 +78,6 @@ def describe_memory(cost: Cost) -> str:
 def count_tiles(plan: TilePlan | None) -> dict[str, int]:
     """Return the numbers of tiles and workers, for the result of a dry run."""
     return {} if plan is None else {"tiles": plan.tiles, "workers": plan.workers}
-
-
-def summarize_counts(report: RunReport) -> str:
-    """Return counts, sizes and times."""
-    seconds = {name: value for name, value in report.seconds.items() if name != "resumed"}
-    times = ", ".join(f"{name} {value:.1f} s" for name, value in seconds.items())
-    return f"{report.title}, {report.sizes}; {times}"
-
-
-def list_remarks(report: RunReport, *, verbose: bool = False) -> list[str]:
-    """Return lines on recovery, losses, unseen parts and packing; `verbose` adds idle
-    regularisers."""
-    from g2ard.jobs.format_loss import score_lines
-    from g2ard.stages.recover.report import describe_idle_regularizers, describe_outcome, describe_time_limit
-    from g2ard.stages.simplify.gaps import RECOVERED_GAPS, gaps_line
-
-    rounds = [entry.recover for entry in report.rounds]
-    recoveries = list(chain.from_iterable(rounds))
-    lines = _compare_own_size(report)
-    lines += map(describe_outcome, recoveries)
-    if rounds and rounds[-1]:
-        lines.append(describe_time_limit(recoveries[-1]))
-    for entry in rounds:
-        if entry and entry[-1].exposure:
-            lines.append(str(entry[-1].exposure))
-    if verbose:
-        lines.append(describe_idle_regularizers(rounds))
-    start = "start" if report.photos else "simplified scene"
-    lines += [
-        describe_loss(kind, f"the {start} is better there (--keep writes it too)") for kind in report.kinds
-    ]
-    lines.append(gaps_line(report.opacity_lost, RECOVERED_GAPS))
-    if report.unseen and report.unseen > _LEAST_REPORTED_SHARE:
-        lines.append(f"{report.unseen:.0%} of the scene is in no view: simplified but not recovered")
-    lines += report.warnings or ()
-    if report.packed:
-        size = report.bytes["file"] or 0
-        unpacked = report.scores["recovered"].psnr
-        lines += score_lines(report.packed, size, unpacked, report.size)
-    return [line for line in lines if line is not None]
-
-
-def _compare_own_size(report: RunReport) -> list[str | None]:
-    """Return the scores at the views' own size, if they were measured, and whether --size did harm."""
-    if not report.own_size:
-        return []
-    before, after = (report.own_size[name] for name in ("simplified", "recovered"))
-    lines: list[str | None] = [
-        f"at the views' own size ({after.scored_in}): {before.psnr:.2f} → {after.psnr:.2f} dB, "
-        f"SSIM {before.ssim:.4f} → {after.ssim:.4f}"
-    ]
-    if (lost := report.scores["recovered"].psnr - after.psnr) > _HARMFUL_SIZE:
-        lines.append(
-            f"warning: the result is {lost:.1f} dB worse at the views' own size than at --size; "
-            "leave --size out, or give a larger one"
-        )
-    return lines
-
-
-def describe_loss(
-    kind: KindScore, hint: str = "the simplified scene is better there (--keep writes it too)"
-) -> str | None:
-    """Describe what recovery lost in the views of a kind, if anything; `hint` ends a warning."""
-    what = f"{kind.kind} views"
-    change = kind.change("ssim")
-    ssim = change.gain if change else 0.0
-    if ssim < -_REPORTED_SSIM_LOSS and kind.psnr.gain > 0:  # neither scene is better
-        return f"recovery lost {-ssim:.3f} SSIM and gained {kind.psnr.gain:.2f} dB in {what}"
-    if kind.psnr.gain < -_REPORTED_PSNR_LOSS or ssim < -_REPORTED_SSIM_LOSS:
-        how = f"{-kind.psnr.gain:.2f} dB" if kind.psnr.gain < -_REPORTED_PSNR_LOSS else f"{-ssim:.3f} SSIM"
-        where = f"{kind.lost} of {kind.views} views lost PSNR"
-        if kind.worst_psnr.gain < 0:
-            where = f"worst view {kind.worst}: {kind.worst_psnr.before:.2f} → {kind.worst_psnr.after:.2f} dB"
-        return f"warning: recovery lost {how} in {what} ({where}); {hint}"
-    if not kind.lost:
-        return None
-    lost = f"{kind.lost} of {kind.views} {what} lost PSNR"
-    how = "gained" if kind.psnr.gain > 0 else "lost"
-    return f"{lost}; the mean of all {kind.views} {how} {abs(kind.psnr.gain):.2f} dB"
 
 
 def say_views(run: Run, views: ViewsReport | None, chosen: bool) -> None:
@@ -207,7 +124,7 @@ def say_weight(run: Run, source: Path, output: Path, splats: Splats, *, lifted: 
     run.say(f"{output}: {made / 1e6:.2f} MB, {what} {given / 1e6:.2f} MB{why}{smaller}")
 
 
-def tell_quality(run: Run, budget: ResolvedBudget, splats: Splats) -> None:
+def tell_quality(run: Run, budget: ResolvedBudget, splats: Splats | PartsStream) -> None:
     """Print the quality of a result with a quality budget; exit with status 3 if it is too low."""
     run.begin("quality")
     judgement = budget.judge(splats)

@@ -17,11 +17,13 @@ from g2ard.errors import InputError
 from g2ard.io import write_splats
 from g2ard.io.scene_formats import scene_format, written_bytes
 from g2ard.io.scenes import read_back
+from g2ard.io.stream import PartsStream
+from g2ard.pipeline.dense import whole
 from g2ard.progress import Say, plural, unsaid
 from g2ard.rendering.metrics import psnr, ssim
 from g2ard.rendering.renderer import Renderer
 from g2ard.scene.cameras import Cameras
-from g2ard.scene.samples import evenly_spaced
+from g2ard.scene.samples import take_evenly
 from g2ard.scene.splats import Splats
 from g2ard.stages.simplify import simplify
 
@@ -118,7 +120,7 @@ def count_for_bytes(
     fewest = min(_FEWEST_GAUSSIANS, most)
     if total is not None and scene_format(name).suffix == ".ply":
         return _count_of_ply(splats, wanted, name, most)
-    sample = splats.take(np.array(evenly_spaced(len(splats), _PROBE_ROWS, floor=True)))
+    sample = take_evenly(splats, _PROBE_ROWS, floor=True)
     count = int(len(sample) * wanted / file_bytes(sample, name))
     if reduce is None:
         return min(max(count, fewest), most)
@@ -282,13 +284,13 @@ class ResolvedBudget:
             splats = simplify(splats, fewer, method="fast").splats
         return splats
 
-    def judge(self, splats: Splats) -> tuple[bool, str] | None:
+    def judge(self, splats: Splats | PartsStream) -> tuple[bool, str] | None:
         """Return whether a result keeps the quality, with a message; None if no quality is required."""
         if self.wanted is None:
             return None
 
         assert self.cameras is not None
-        got = quality(self.renders, as_file(splats, self.file), self.cameras)
+        got = quality(self.renders, as_file(whole(splats), self.file), self.cameras)
         count, views = plural(len(splats), "Gaussian"), plural(len(self.cameras), "view")
         line = f"{count} keep {got} in the {views} that chose the count"
         if got.meets(self.wanted):

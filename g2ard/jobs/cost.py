@@ -83,10 +83,10 @@ def cost_of(job: Any, count: int, *, page: bool = True) -> Cost:
         job: a `DistillJob`; its module uses this one.
         page: whether pages with the result are written.
     """
-    train, test = job.views.train.cameras, job.views.test
-    apart = 0 if job.views.apart is None else len(job.views.apart)
+    train = job.views.train.cameras
+    untrained = sum(map(len, job.views.untrained))
     pixels = _mean_pixels(train)
-    views = len(test) + apart + (len(train) if job.recovers else 0)
+    views = untrained + (len(train) if job.recovers else 0)
     trains = job.recovers and not job.is_kept(count)
     steps: int | None = 0
     if trains:
@@ -157,7 +157,7 @@ def _peak_bytes(job: Any, count: int, page: bool, *, trains: bool) -> int:
     rows = 0 if job.plan else dense  # that view.html may show
     chosen = job.config.select.count_of(len(train))
     used = [train if chosen == "auto" else train.take(range(min(chosen, len(train))))] if trains else []
-    used += [part for part in (views.test, views.apart, views.twice) if part is not None]
+    used += [*views.untrained, *filter(None, [views.twice])]
     full = [] if views.full is None else [within_pixels(views.full)]
     targets = sum(_target_bytes(part, job.prior if job.renders else None) for part in (used, full))
     kept = _PROGRAM_BYTES + _sampled(_SURVEY, dense) + targets + _image_bytes([*used, *full]) + 2 * small

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from g2ard.config.checks import AtLeastOne, Positive
-from g2ard.config.choices import Focus, FormatName, RenderModel
+from g2ard.config.choices import Focus, FormatName, RenderModel, is_made
 from g2ard.config.schema import Settings, full_paths, values_of
 from g2ard.errors import InputError
 from g2ard.jobs.inputs import Views
@@ -66,6 +66,11 @@ class DistillOptions(Settings):
         config = self.config
         papers = config.select.views_count is not None or not config.recover.schedule.means_in_scales
         return config.select.focus or ("far" if papers else None)
+
+    @property
+    def photo_views(self) -> Views | None:
+        """Given views whose photos a point cloud learns from."""
+        return None if is_made(self.views) or self.photos is False else self.views
 
     def configured(
         self, regularizers: Regularizers | None = None, sh_degree: int | None = None

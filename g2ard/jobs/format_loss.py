@@ -13,14 +13,10 @@ from g2ard.io.scenes import read_back
 from g2ard.io.spz import names_axes
 from g2ard.jobs.budget_search import clipped_images, quality
 from g2ard.poses import plan_pool
-from g2ard.report.run import Packed
+from g2ard.report.run import WARNED_FORMAT_LOSS, better_format
 from g2ard.scene.splats import Splats
 from g2ard.scene.transform import change_of_axes, with_axes
 
-_WARNED_LOSS = 1.0
-"""Loss in dB that is worth a warning."""
-_INVISIBLE_LOSS_PSNR = 45.0
-"""PSNR in dB above which nobody sees a loss."""
 _GOOD_PSNR = 35.0
 """PSNR of a good scene, to which the difference between two scenes is related, dB."""
 _LOSS_VIEWS = 4
@@ -31,23 +27,6 @@ _LOSS_ROWS = 100_000
 """Gaussians that these views are planned by."""
 _MOST_COMPARED_GAUSSIANS = 2_000_000
 """Gaussians above which scenes are not compared."""
-
-
-def score_lines(packed: Packed, size: int, unpacked: float, pixels: str) -> list[str]:
-    """Return a packed file's size in bytes and score beside that of the unpacked scene, and a warning if its
-    loss is large and visible. `pixels` is the size of the views.
-
-    >>> score_lines(Packed("scene.sog", 37.86, 0.9), 1_310_000, 37.94, "800×600 px")
-    ['scene.sog: 1.31 MB, 37.9 dB in held-out views, 800×600 px (37.9 as .ply)']
-    >>> len(score_lines(Packed("scene.sog", 58.6, 0.9), 1_310_000, 62.6, "800×600 px"))
-    1
-    """
-    name, lost = packed.file, unpacked - packed.psnr
-    scores = f"{packed.psnr:.1f} dB in held-out views, {pixels} ({unpacked:.1f} as .ply)"
-    lines = [f"{name}: {size / 1e6:.2f} MB, {scores}"]
-    if lost > _WARNED_LOSS and packed.psnr < _INVISIBLE_LOSS_PSNR:
-        lines.append(f"warning: {name}: the format costs {lost:.1f} dB; {_better(name)}")
-    return lines
 
 
 def loss_warning(path: Path, splats: Splats, options: dict[str, Any]) -> str | None:
@@ -68,14 +47,9 @@ def loss_warning(path: Path, splats: Splats, options: dict[str, Any]) -> str | N
         stored = with_axes(stored, change_of_axes("RDF", "RUB"))
     away = quality(clipped_images(splats, cameras), stored, cameras).psnr
     lowered = -10 * float(np.log10(10 ** (-_GOOD_PSNR / 10) + 10 ** (-away / 10)))
-    if _GOOD_PSNR - lowered <= _WARNED_LOSS:
+    if _GOOD_PSNR - lowered <= WARNED_FORMAT_LOSS:
         return None
     return (
         f"warning: {path}: renders are {away:.1f} dB PSNR from the original's, which lowers a score of "
-        f"{_GOOD_PSNR:.0f} dB to {lowered:.1f}; {_better(path.name)}"
+        f"{_GOOD_PSNR:.0f} dB to {lowered:.1f}; {better_format(path.name)}"
     )
-
-
-def _better(name: str) -> str:
-    """Name formats that lose less than that of a file."""
-    return ".ply loses nothing" if scene_format(name).loss == 1 else ".sog loses less, .ply nothing"

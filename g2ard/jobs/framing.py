@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from g2ard.rendering.renderer import Renderer
 from g2ard.scene.cameras import Camera, Cameras
-from g2ard.scene.samples import evenly_spaced
+from g2ard.scene.samples import take_evenly
 from g2ard.scene.splats import Splats
 
 Fields = tuple[tuple[float, float], ...]
@@ -142,7 +142,7 @@ def _surroundings(
     depth = drawn.median.ravel().astype(np.float64)
     surface = np.stack([x * depth, y * depth, depth], axis=1) @ view.viewmat[:3, :3] + view.position
     witnesses = np.zeros(len(surface), np.int64)
-    some = cameras.take(evenly_spaced(len(cameras), _PHOTOS)).scaled(_PHOTO_SIDE)
+    some = take_evenly(cameras, _PHOTOS).scaled(_PHOTO_SIDE)
     for photo in some:
         witnesses += _sees(renderer, photo, surface)
     own = (np.abs(x) <= _halves(view)[0]) & (np.abs(y) <= _halves(view)[1])
@@ -168,5 +168,5 @@ def _thinned(scene: Splats) -> Splats:
     """Return a sample of a large scene, its Gaussians widened so that surfaces stay closed."""
     if len(scene) <= _ROWS:
         return scene
-    some = scene.take(np.array(evenly_spaced(len(scene), _ROWS)))
+    some = take_evenly(scene, _ROWS)
     return replace(some, scales=some.scales * np.float32(np.sqrt(len(scene) / _ROWS)))

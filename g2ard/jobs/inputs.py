@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +13,6 @@ from numpy.typing import NDArray
 from g2ard.config.choices import Axes, RenderModel
 from g2ard.errors import InputError
 from g2ard.io import Source, read_view_set
-from g2ard.io.exposures import find_exposures
 from g2ard.io.splits import (
     for_scores,
     for_training,
@@ -26,8 +24,7 @@ from g2ard.io.splits import (
 )
 from g2ard.io.types import Cloud, ViewFiles, ViewSet
 from g2ard.progress import Progress, Say, plural, silent, unsaid
-from g2ard.rendering.renderer import RasterSettings
-from g2ard.rendering.targets import Photos, PhotosOrRenders, Targets, TeacherRenders, with_pixels
+from g2ard.rendering.targets import Targets, with_pixels
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.regions import in_any
 from g2ard.scene.splats import Splats
@@ -90,11 +87,17 @@ def axes_of(cloud: Cloud, name: str, say: Say = unsaid, progress: Progress = sil
     return axes
 
 
+def read_points(source: Source, name: str, say: Say, *, bare: bool = False) -> Cloud:
+    """Read a point cloud, and report its notes under a name; a `bare` one may be without colours."""
+    cloud = source.cloud(bare=bare).whole()
+    for note in cloud.notes:
+        say(f"{name}: {note}")
+    return cloud
+
+
 def lifted_cloud(source: Source, progress: Progress = silent, say: Say = unsaid) -> Splats:
     """Read a point cloud, report its notes, and lift it."""
-    cloud = source.cloud().whole()
-    for note in cloud.notes:
-        say(f"{source}: {note}")
+    cloud = read_points(source, str(source), say)
     axes = axes_of(cloud, str(source), say, progress)
     splats = lift(cloud.points.positions, cloud.points.colors, axes=axes, progress=progress)
     discs = plural(len(splats), "disc")
@@ -199,35 +202,6 @@ def _read(views: Views, say: Say, *, unpictured: bool = False) -> tuple[ViewSet,
     for note in views_read.notes:
         say(f"{views}: {note}")
     return views_read, views.path if isinstance(views, ViewFiles) else Path(views)
-
-
-def make_targets(
-    cameras: Cameras,
-    teacher: Splats | Callable[[Cameras], Targets] | None,
-    background: tuple[float, float, float],
-    *,
-    mixed: bool = False,
-    settings: RasterSettings | None = None,
-    say: Say = unsaid,
-) -> Targets:
-    """Return targets, made on access: renders of the teacher, or photos if there is no teacher.
-
-    With `mixed` and a teacher, each view's photo is used, or a render if it has none.
-
-    Args:
-        teacher: the scene, or a function that renders it.
-    """
-    renders: Any = {"settings": settings, "lazy": True}
-    if teacher is not None and not mixed:
-        if not isinstance(teacher, Splats):
-            return teacher(cameras)
-        return TeacherRenders(teacher, cameras, background=background, **renders)
-    exposures = find_exposures(cameras)
-    if exposures:
-        say(f"exposure.json: corrected the exposure of {plural(len(exposures), 'photo')}")
-    if teacher is None:
-        return Photos(cameras, background=background, exposures=exposures)
-    return PhotosOrRenders(cameras, teacher, background=background, exposures=exposures, **renders)
 
 
 def scorable(targets: Targets, say: Say = unsaid) -> Targets:

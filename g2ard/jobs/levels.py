@@ -23,20 +23,25 @@ from g2ard.io.scenes import tell
 from g2ard.io.tile_store import TileStore
 from g2ard.jobs.budget import Budget
 from g2ard.jobs.comparison import made_of_points
-from g2ard.jobs.cost import Cost, cost_of
-from g2ard.jobs.distill import DistillJob, preparing
+from g2ard.jobs.cost import TRAINER_BYTES, Cost, cost_of
+from g2ard.jobs.distill import preparing
+from g2ard.jobs.distill_job import DistillJob
 from g2ard.jobs.distill_options import DistillOptions
 from g2ard.jobs.inputs import GivenViews, Views, load_scene
 from g2ard.jobs.viewer_frame import backdrop, frame_of, up_of
 from g2ard.levels.tileset import TILE_OF_SCENE, Georeference, is_outside, map_system, metres_of
 from g2ard.levels.tileset import save_tileset as write_tileset
 from g2ard.levels.tree import Cut, Level, aligned
-from g2ard.pipeline.dense import Dense
+from g2ard.pipeline.dense import Dense, InMemory
 from g2ard.progress import Progress, Say, direction, plural, silent, unsaid
+from g2ard.rendering.metrics import psnr
+from g2ard.rendering.targets import Targets, fill
 from g2ard.report.labels import name_scenes
 from g2ard.scene.regions import sky_mask
-from g2ard.scene.samples import evenly_spaced
+from g2ard.scene.samples import take_evenly
 from g2ard.scene.splats import Splats
+from g2ard.stages.evaluate import evaluate
+from g2ard.stages.simplify.gaps import say_gaps
 from g2ard.system.shown import Shown
 from g2ard.viewer.page import Start, write_globe_page, write_stream_page
 
@@ -149,12 +154,46 @@ class LevelsJob:
             began, level = time.perf_counter(), scene
             scores: list[float | None] = []
             if ratio > 1:
-                level, finer, *scores = job.level(finer, count, job.views.resized(size), work)
+                level, finer, *scores = self._level(finer, count, size, work)
             report = LevelReport(count, ratio, size, time.perf_counter() - began, *scores)
             job.say(report.line(len(levels)))
             levels.append(level.store if isinstance(level, InTiles) else level.sample)
             reports.append(report)
         return Levels(tuple(levels), tuple(reports), self.sky)
+
+    def _level(
+        self, finer: Dense, count: int, size: int, work: Path | None
+    ) -> tuple[Dense, Dense, float, float | None]:
+        """Make a level; return it, the same before recovery, and the PSNR of the latter and of the former."""
+        job = replace(self.job, views=replace(self.job.views.resized(size), full=None))
+        held_out = job.targets.held_out
+        fill(held_out, job.progress)
+        fits = job.plan is None or TRAINER_BYTES * count <= job.plan.memory
+        if job.recovers and fits:
+            done = job.reduce(finer, count, work)
+            lost = job.dense.opacity_lost(done.splats, held_out.cameras)
+            say_gaps(lost, job.say, f"give levels more Gaussians (--ratios), here {count:,}")
+            on = done.scored_on(held_out)
+            level, merged = InMemory(done.splats), InMemory(done.simplified)
+            return level, merged, _mean_psnr(job, merged, on), _mean_psnr(job, level, on)
+        if job.recovers:
+            job.say(f"{plural(count, 'Gaussian')} are too many for the memory to recover: merged only")
+        cameras = self.job.views.merging or self.job.views.train.cameras  # at full size
+        config = job.config.simplify
+        small = finer.merged(count, cameras, config, gaps=True, progress=job.progress)
+        say_gaps(small.report.opacity_lost, job.say)
+        derived = finer.derived(small.splats, "merged")
+        return derived, derived, _mean_psnr(job, derived, held_out), None
+
+
+def _mean_psnr(job: DistillJob, scene: Dense, on: Targets) -> float:
+    """Return the mean PSNR of a level in some views."""
+    background = job.config.recover.background
+    if isinstance(scene, InMemory):
+        progress = job.progress
+        return evaluate(scene.splats, on, stage="scoring", background=background, progress=progress).psnr
+    drawn = scene.images(on.cameras, background)
+    return float(np.mean([psnr(drawn[view], on[view]) for view in range(len(on.cameras))]))
 
 
 @contextmanager
@@ -375,8 +414,8 @@ def save_tileset(
 
 def _extent_line(coarsest: Level, metres: float, *, known: bool) -> str:
     """Describe the extent of a scene, and warn if it is improbable."""
-    rows = np.array(evenly_spaced(len(coarsest), _UP_SAMPLE, floor=True))
-    low, high = np.percentile(coarsest.take(rows).means, (1, 99), axis=0)
+    some = take_evenly(coarsest, _UP_SAMPLE, floor=True)
+    low, high = np.percentile(some.means, (1, 99), axis=0)
     across = metres * float((high - low).max())
     text = f"the scene is {across:,.3g} m across" if across < 1000 else f"the scene is {across:,.0f} m across"
     if not known:
@@ -396,8 +435,7 @@ def tileset_up(
     if up is None and coarse.up is None and coarse.offset.any():
         axis = np.array([0.0, 0, 1])
     else:
-        rows = np.array(evenly_spaced(len(coarse), _UP_SAMPLE, floor=True))
-        axis = up_of(coarse.take(rows), up)
+        axis = up_of(take_evenly(coarse, _UP_SAMPLE, floor=True), up)
     say(f"up is {direction(axis)}" + ("" if up else "; --up X,Y,Z changes it"))
     return axis
 
@@ -425,9 +463,9 @@ def write_level_page(
         source: the source of the scene beside `given`, if it is open.
     """
     coarse = levels[-1]
-    few = coarse.take(np.array(evenly_spaced(len(coarse), _ROWS, floor=True)))
+    few = take_evenly(coarse, _ROWS, floor=True)
     frame = frame_of(few, given)
-    finest = levels[0].take(np.array(evenly_spaced(len(levels[0]), _ROWS, floor=True)))
+    finest = take_evenly(levels[0], _ROWS, floor=True)
     of_points = given.beside is not None and made_of_points(Path(given.beside), source)
     behind = backdrop(background, [finest], of_points=of_points)
     page, offset = folder / "index.html", np.asarray(few.offset)

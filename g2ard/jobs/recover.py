@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +14,10 @@ from g2ard.config.checks import AtLeastOne, checks_arguments
 from g2ard.config.choices import Colour, RenderModel
 from g2ard.config.schema import changed, full_paths, keywords
 from g2ard.errors import InputError, require
-from g2ard.io.types import ViewSet
 from g2ard.jobs.cost import Cost, cost_of_recovery
-from g2ard.jobs.inputs import Views, load_scene
-from g2ard.jobs.teaching import Teaching, check_teacher
+from g2ard.jobs.inputs import GivenViews, Views, load_scene
+from g2ard.jobs.run_views import views_or_pool
+from g2ard.jobs.teaching import RunTargets, Teaching, check_teacher, read_views
 from g2ard.pipeline.presets import PRESETS, configured
 from g2ard.progress import Detail, Progress, Say, plural, silent, unsaid
 from g2ard.rendering.targets import RENDERS, Exposed, Targets, checked_targets, fill, kinds_of
@@ -28,7 +29,6 @@ from g2ard.stages.recover.anchors import Anchors, PriorMeasures, choose_regulari
 from g2ard.stages.recover.config import RecoverConfig, Schedule
 from g2ard.stages.recover.optimize import Recovered, Watch
 from g2ard.stages.recover.optimize import recover as optimize
-from g2ard.system.cached import cached_property
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,41 +36,37 @@ class RecoverJob:
     """A prepared recovery: inputs are read and everything is decided.
 
     Args:
+        teacher: the dense scene; None if all targets are photos.
         weights: sampling weight of each view; None draws all equally often.
         anchors: the student before any recovery, or None.
         preset: the regularisers chosen, and why.
-        scored: views whose test split is scored; None for no scores.
-        validation: renders of views of other kinds that limit changes; None without.
     """
 
     student: Splats
-    views: ViewSet
-    targets: Targets
+    teacher: Splats | None
+    targets: RunTargets
     config: RecoverConfig
     weights: NDArray[Any] | None
     anchors: Splats | None
     preset: str
     measures: PriorMeasures
-    teaching: Teaching
-    scored: Views | None
-    size: int | None
-    validation: Targets | None = None
+    progress: Progress = silent
 
     def run(self, checkpoint: Path | None = None, watch: Watch | None = None) -> Recovered:
         """Recover the student; see `g2ard.recover`."""
-        built, in_plane = self.anchors, self.config.regularizers.in_plane
+        built, in_plane, train = self.anchors, self.config.regularizers.in_plane, self.targets.train
         if not self._same:
-            for targets in filter(None, (self.targets, self.validation)):
-                fill(targets, self.teaching.progress)
+            for targets in filter(None, (train, self.validation)):
+                fill(targets, self.progress)
         return optimize(
             self.student,
-            self.targets,
+            train,
             self.config,
             weights=self.weights,
             anchors=None if built is None else Anchors.of(built, in_plane),
             validation=self.validation,
             checkpoint=checkpoint,
-            progress=self.teaching.progress,
+            progress=self.progress,
             watch=watch,
             skip_same=True,
         )
@@ -78,8 +74,7 @@ class RecoverJob:
     @property
     def _same(self) -> bool:
         """Whether the student is the teacher, so that nothing is to be learned."""
-        dense = self.teaching.dense
-        return dense is not None and dense.fingerprint() == self.student.fingerprint()
+        return self.teacher is not None and self.teacher.fingerprint() == self.student.fingerprint()
 
     @property
     def cost(self) -> Cost:
@@ -87,35 +82,33 @@ class RecoverJob:
         steps: int | None = self.config.horizon if self.config.recovery_time is None else None
         return cost_of_recovery(
             self.student,
-            self.views.cameras,
+            self.targets.train.cameras,
             0 if self._same else steps,
             scored=None if self.held_out is None else self.held_out.cameras,
             validation=None if self.validation is None else self.validation.cameras,
-            teacher=self.teaching.dense,
+            teacher=self.teacher,
         )
 
-    @cached_property
+    @property
     def held_out(self) -> Targets | None:
         """Held-out targets for scoring; None without such views."""
-        return None if self.scored is None else self.teaching.held_out(self.scored, self.size)
+        return self.targets.held_out if len(self.targets.views.test) else None
+
+    @property
+    def validation(self) -> Targets | None:
+        """Renders of views of other kinds that limit changes; None without."""
+        return self.targets.validation if self.config.schedule.guarded else None
 
     def score(self, result: Recovered) -> tuple[KindScore, ...]:
         """Score student and result in held-out views, by kind of view; empty without such views."""
         if self.held_out is None:
             return ()
         held_out = Exposed(self.held_out) if result.report.exposure else self.held_out
-        before, after = (
-            evaluate(
-                splats,
-                held_out,
-                background=self.config.background,
-                progress=self.teaching.progress,
-                stage=f"score {name}",
-            ).views
-            for name, splats in (("simplified", self.student), ("recovered", result.splats))
-        )
-        given = set(self.held_out.cameras.kinds) == {USUAL}
-        return summarize_by_kind(before, after, "given" if given else USUAL)
+        score = partial(evaluate, background=self.config.background, progress=self.progress)
+        before = score(self.student, held_out, stage="score simplified")
+        after = score(result.splats, held_out, stage="score recovered")
+        given = set(held_out.cameras.kinds) == {USUAL}
+        return summarize_by_kind(before.views, after.views, "given" if given else USUAL)
 
 
 @checks_arguments
@@ -287,21 +280,24 @@ def prepare(
     named = {**PRESETS[preset], **given}
     config = configured(RecoverConfig(), preset, given)
     start = load_scene(student, say, render_model).narrowed()
-    teaching = Teaching(
-        teacher,
+    dense = None if teacher is None else load_scene(teacher, say, render_model)
+    teaching = Teaching.by(
+        dense,
         config.background,
         chosen="recover.background" in given,
         photos=photos,
-        render_model=render_model,
-        seed=config.seed,
         rough=rough,
-        progress=progress,
         say=say,
     )
-    pool = teaching.views(views, start)
-    chosen, targets = teaching.training(start, pool, split, size)
+    if dense is not None:
+        beside = None if isinstance(teacher, Splats) else teacher
+        asked = GivenViews(views, beside, seed=config.seed, rough=rough)
+        views = views_or_pool(dense, asked, student=start, progress=progress, say=say)
+    assert views is not None  # `check_teacher`
+    targets = RunTargets.of(teaching, read_views(teaching, start, views, split, size))
+    chosen = targets.views.train
     of_split = "training view" if split == "train" else f"{split} view"
-    say(f"{plural(len(chosen.cameras), of_split)} against {kinds_of(targets)}")
+    say(f"{plural(len(chosen.cameras), of_split)} against {kinds_of(targets.train)}")
     weighted = named.get("select.weighted", True) if weighted is None else weighted
     weights = chosen.weights if weighted else None
     if weights is not None:
@@ -309,30 +305,17 @@ def prepare(
     built = None if anchors is None else _built(anchors, start, render_model, say)
     regularizers, why, measures = choose_regularizers(
         named.get("recover.regularizers"),
-        teaching.dense or built or start,
-        None if teaching.dense or rough else chosen.cameras,
+        dense or built or start,
+        None if dense or rough else chosen.cameras,
         paper=named.get("recover.schedule") == "paper",
     )
     config = configured(RecoverConfig(), preset, {**given, "recover.regularizers": regularizers})
     if config.recovery_time is None:
-        of_photos = kinds_of(targets) != RENDERS
+        of_photos = kinds_of(targets.train) != RENDERS
         config = replace(config, steps=config.final_steps(start, chosen.cameras, of_photos=of_photos))
-    of_student = "" if teaching.dense else "; measured on the student, as there is no teacher"
+    of_student = "" if dense else "; measured on the student, as there is no teacher"
     say(Detail(f"regularisers: {why}{of_student}"))
-    return RecoverJob(
-        start,
-        chosen,
-        targets,
-        config,
-        weights,
-        built,
-        why,
-        measures,
-        teaching,
-        pool if split == "train" else None,
-        size,
-        teaching.validation(pool, size) if split == "train" and config.schedule.guarded else None,
-    )
+    return RecoverJob(start, dense, targets, config, weights, built, why, measures, progress)
 
 
 def _built(

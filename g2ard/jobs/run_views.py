@@ -27,12 +27,13 @@ from g2ard.jobs.inputs import (
 from g2ard.jobs.view_checks import as_pool, check_sight, given_or_found, warn_of_sight
 from g2ard.jobs.viewer_frame import level_up
 from g2ard.pipeline.config import SelectConfig
+from g2ard.pipeline.dense import Dense, InMemory
 from g2ard.pipeline.distill import RunViews, draw_weights
 from g2ard.poses import Pool, best_views, plan_pool, turntable
 from g2ard.poses.zooms import zoomed
 from g2ard.progress import Progress, Say, direction, plural, silent, unsaid
 from g2ard.scene.cameras import USUAL, Camera, Cameras, rows_by_kind
-from g2ard.scene.samples import evenly_spaced
+from g2ard.scene.samples import evenly_spaced, take_evenly
 from g2ard.scene.splats import Splats
 from g2ard.stages.recover.config import RecoverConfig, count_steps_for_renders
 from g2ard.stages.select.light import complete
@@ -101,7 +102,7 @@ _WEIGHT_OTHERS = {"near": 8, "anywhere": 16}
 
 
 def views_of(
-    prior: Splats,
+    dense: Dense,
     options: DistillOptions,
     count: int,
     *,
@@ -109,7 +110,6 @@ def views_of(
     beside: str | Path | None = None,
     teach: bool = True,
     use: Use = "distil",
-    represents: float = 1.0,
     rough: bool = False,
     progress: Progress = silent,
     say: Say = unsaid,
@@ -120,7 +120,7 @@ def views_of(
     join them (`g2ard.stages.select.light`), measured on the scene merged to `count` by the method `fast`.
 
     Args:
-        prior: the dense scene.
+        dense: the dense scene.
         options: the views, or None for those found beside the scene or generated; `focus`, the kind of views
             added to views that are given without photos or generated.
         count: Gaussians of the compact scene.
@@ -129,19 +129,18 @@ def views_of(
         teach: whether the scene can render targets; otherwise views without a photo are skipped and no views
             are generated.
         use: what the message about generated views counts.
-        represents: Gaussians per row if `prior` is a sample of a larger scene; the pool grows with it.
         rough: see `GivenViews`.
     """
+    prior = dense.sample
     wanted = ["train"] if options.held_out is not None else ["train", "test"]
     asked = GivenViews(options.views, beside, options.up, options.config.recover.seed, rough=rough)
     found, are_found = given_or_found(asked, prior, wanted, say)
-    plan = partial(_planned, prior, asked, represents=represents, progress=progress)
+    plan = partial(_planned, dense, asked, progress=progress)
     select = replace(options.config.select, focus=options.focus)
     mix = partial(
         _mixed,
-        prior=prior,
+        dense=dense,
         count=count,
-        represents=represents,
         size=options.size,
         rough=rough,
         progress=progress,
@@ -167,7 +166,7 @@ def views_of(
                 mix,
                 select=select,
                 share=share,
-                learns=not is_untouched(options.config.recover, prior, count, round(represents * len(prior))),
+                learns=not is_untouched(options.config.recover, prior, count, dense.total),
             ),
             use,
             say,
@@ -175,7 +174,7 @@ def views_of(
         )
         if use == "merging" or options.config.simplify.method == "paper":
             return views
-        merging = cameras_for_weights(prior, asked, represents=represents, progress=progress)
+        merging = cameras_for_weights(dense, asked, progress=progress)
         return replace(views, merging=merging)
     train, test = given or split_views(found, options.held_out, say, unpictured=teach)
     if not are_found:
@@ -197,8 +196,8 @@ def views_of(
     except InputError:  # the scene has no room for poses
         return RunViews(train, test, full=full)
     weigh = partial(draw_weights, prior, train, options.config, progress)
-    train, apart, _ = mix(train, planned, select=select, weigh=weigh, zoom=False)
-    return RunViews(train, test, apart, full=full)
+    train, others, _ = mix(train, planned, select=select, weigh=weigh, zoom=False)
+    return RunViews(train, test, *_halved(others), full=full)
 
 
 def is_untouched(recover: RecoverConfig, prior: Splats, count: int, total: int) -> bool:
@@ -228,7 +227,7 @@ def shrunk(cameras: Cameras, size: int | None) -> Cameras | None:
 def within_pixels(cameras: Cameras) -> Cameras:
     """Return as many of the views as `FULL_PIXELS` hold, evenly spaced."""
     largest = int((cameras.widths * cameras.heights).max())
-    return cameras.take(evenly_spaced(len(cameras), max(1, FULL_PIXELS // largest)))
+    return take_evenly(cameras, max(1, FULL_PIXELS // largest))
 
 
 def _generated(
@@ -248,19 +247,14 @@ def _generated(
     """
     names = planned.cameras.names
     held_back = split_mask(None, names, "test") if held_out is None else np.zeros(len(names), bool)
-    usual = ViewSet(planned.cameras, splits=tuple(np.where(held_back, "test", "train").tolist()))
-    usual = usual.take(~held_back)
-    test = planned.cameras.take(held_back)
-    if share < 1:
-        chosen = _first(usual.cameras, share)
-        usual = ViewSet(chosen, splits=("train",) * len(chosen))
-        test = _first(test, share, _LEAST_SCORED)
-    train, apart, unseen = mix(usual, planned)
+    usual = spread_prefix(planned.cameras.take(~held_back), share)
+    test = spread_prefix(planned.cameras.take(held_back), share, _LEAST_SCORED)
+    train, others, unseen = mix(ViewSet(usual, splits=("train",) * len(usual)), planned)
     pool = ViewSet(
         Cameras.of([*train.cameras, *test]),
         splits=("train",) * len(train.cameras) + ("test",) * len(test),
     ).fitted(size)  # runs are compared in the views that they write
-    counts = _uses(use, len(train.cameras), len(test if held_out is None else held_out), len(apart or ()))
+    counts = _uses(use, len(train.cameras), len(test if held_out is None else held_out), len(others or ()))
     say(f"views: {counts}; {_of(planned, pool.cameras)}")
     train, scored = train.fitted(size), test
     if held_out is not None:
@@ -269,19 +263,27 @@ def _generated(
     twice = None
     if use == "distil" and held_out is None:
         twice = _twice(scored, max(2, round(share * _TWICE_VIEWS)))
-    apart = apart and apart.fitted(size)
+    validation, apart = _halved(others and others.fitted(size))
     guess = planned.why.rpartition("; ")[2] if "guess" in planned.why else None
-    return RunViews(train, scored, apart, pool, unseen, full, twice, guess)
+    return RunViews(train, scored, validation, apart, pool, unseen, full, twice, guess)
+
+
+def _halved(others: Cameras | None) -> tuple[Cameras | None, Cameras | None]:
+    """Return every second one of further views of other kinds, which validate, and the rest for scoring."""
+    if others is None or len(others) < 2:
+        return None, None
+    validation, apart = (others.take(range(first, len(others), 2)) for first in (0, 1))
+    return validation, apart
 
 
 def _twice(cameras: Cameras, count: int) -> Cameras | None:
     """Return some views at twice their size, None if that is very large."""
     longest = 2 * int(np.maximum(cameras.widths, cameras.heights).max())
-    some = cameras.take(evenly_spaced(len(cameras), count)).scaled(longest)
+    some = take_evenly(cameras, count).scaled(longest)
     return replace(some, kinds=(_TWICE,) * len(some)) if longest <= _TWICE_LONGEST else None
 
 
-def _first(cameras: Cameras, share: float, least: int = 1) -> Cameras:
+def spread_prefix(cameras: Cameras, share: float, least: int = 1) -> Cameras:
     """Return a share of the views, each next one farthest from those before; fewer are a prefix of more."""
     wanted = max(least, round(share * len(cameras)))
     if wanted >= len(cameras):
@@ -320,9 +322,8 @@ def _mixed(
     train: ViewSet,
     planned: Pool,
     *,
-    prior: Splats,
+    dense: Dense,
     count: int,
-    represents: float,
     select: SelectConfig,
     size: int | None,
     progress: Progress,
@@ -345,7 +346,7 @@ def _mixed(
         zoom: whether some of the training views become zooms.
         rough: whether to add as many views as usual instead of choosing them.
     """
-    usual, times = len(train.cameras), _times(prior, represents)
+    usual, times = len(train.cameras), pool_times(dense.total)
     spare, focus = max(_LEAST_APART, round(_VIEWS_APART * times * share)), select.focus
     least = round(_TRAINING_VIEWS * times * share)
     grown = max(1.0, min(usual / (_TRAINING_VIEWS * share), _POOL_GROWTH * times))
@@ -371,9 +372,9 @@ def _mixed(
     others = Cameras.of(apart).fitted(size) if apart else None
     more, unseen = Cameras.of(offered) if offered and learns else None, None
     if focus is None and more is not None and rough:
-        more = more.take(evenly_spaced(len(more), round(_USUAL_OTHERS * usual)))
+        more = take_evenly(more, round(_USUAL_OTHERS * usual))
     elif focus is None and more is not None:
-        compact, per_row = _compact(prior, count, represents, progress)
+        compact, per_row = _compact(dense, count, progress)
         order, _, unseen = complete(
             compact,
             train.cameras,
@@ -406,11 +407,12 @@ def _elsewhere(views: Sequence[Camera], others: Sequence[Camera]) -> list[Camera
     return [replace(view, name=f"{view.name} (more)") for view in found]
 
 
-def _compact(prior: Splats, count: int, represents: float, progress: Progress) -> tuple[Splats, float]:
-    """Return a scene that looks like `prior` merged to `count`, and the Gaussians that a row stands for."""
+def _compact(dense: Dense, count: int, progress: Progress) -> tuple[Splats, float]:
+    """Return a scene like a dense one merged to `count`, and the Gaussians that a row stands for."""
+    prior = dense.sample
     rows = min(count, _COMPACT_ROWS, len(prior))
-    if represents > 1:  # a sample's Gaussians cover for the others
-        prior = replace(prior, scales=prior.scales * np.float32(np.sqrt(represents)))
+    if dense.total > len(prior):  # a sample's Gaussians cover for the others
+        prior = replace(prior, scales=prior.scales * np.float32(np.sqrt(dense.total / len(prior))))
     small = prior if rows == len(prior) else simplify(prior, rows, method="fast", progress=progress).splats
     return small, count / rows
 
@@ -436,13 +438,12 @@ def views_or_pool(
         return found
     grow = _POOL_GROWTH if count is None else 1.0
     count = _POOL_VIEWS if count is None else count
-    planned = _planned(scene, given, count, progress=progress, grow=grow)
+    planned = _planned(InMemory(scene), given, count, progress=progress, grow=grow)
     if student is not None:
         mix = partial(
             _mixed,
-            prior=student,
+            dense=InMemory(student),
             count=len(student),
-            represents=1.0,
             select=SelectConfig(),
             size=None,
             rough=given.rough,
@@ -451,9 +452,9 @@ def views_or_pool(
         )
         made = _generated(planned, None, None, mix, "distil", say)
         assert made.pool is not None
-        apart = made.apart or ()
-        splits = tuple("val" if row % 2 == 0 else "test" for row in range(len(apart)))
-        return ViewSet(Cameras.of([*made.pool.cameras, *apart]), splits=made.pool.splits + splits)
+        validation, apart = made.validation or (), made.apart or ()
+        splits = (*made.pool.splits, *["val"] * len(validation), *["test"] * len(apart))
+        return ViewSet(Cameras.of([*made.pool.cameras, *validation, *apart]), splits=splits)
     say(f"views: {len(planned.cameras)} generated; {_of(planned, planned.cameras)}")
     return ViewSet(planned.cameras, splits=splits_of(None, planned.cameras.names))
 
@@ -504,7 +505,7 @@ def looks_at(
         say(f"views: {count} generated")
     if len(best) == count:
         return best
-    pool = _planned(scene, given, count - len(best), progress=progress)
+    pool = _planned(InMemory(scene), given, count - len(best), progress=progress)
     return Cameras.of([*best, *pool.cameras])
 
 
@@ -518,10 +519,9 @@ def _of(pool: Pool, cameras: Cameras) -> str:
 
 
 def cameras_for_weights(
-    scene: Splats,
+    dense: Dense,
     given: GivenViews,
     *,
-    represents: float = 1.0,
     progress: Progress = silent,
     say: Say = unsaid,
 ) -> Cameras | None:
@@ -529,22 +529,15 @@ def cameras_for_weights(
 
     Arguments are those of `views_of`; of `given` the training split is used. None means no views.
     """
-    found, are_found = given_or_found(given, scene, ["train"], say)
+    found, are_found = given_or_found(given, dense.sample, ["train"], say)
     if found is not None:
         cameras = load_views(found, "train", None, say)
         if are_found:
             return as_pool(cameras)
-        warn_of_sight(scene, cameras, say)
+        warn_of_sight(dense.sample, cameras, say)
         return cameras
     try:
-        pool = _planned(
-            scene,
-            given,
-            _WEIGHT_VIEWS,
-            rows=_WEIGHT_ROWS,
-            represents=represents,
-            progress=progress,
-        )
+        pool = _planned(dense, given, _WEIGHT_VIEWS, rows=_WEIGHT_ROWS, progress=progress)
         others = [camera for kind, count in _WEIGHT_OTHERS.items() for camera in pool.more(kind, count)]
         return Cameras.of([*pool.cameras, *others])
     except InputError as e:
@@ -553,20 +546,16 @@ def cameras_for_weights(
 
 
 def _planned(
-    prior: Splats,
-    given: GivenViews,
-    count: int,
-    *,
-    rows: int = _POOL_SAMPLE,
-    represents: float = 1.0,
-    **options: Any,
+    dense: Dense, given: GivenViews, count: int, *, rows: int = _POOL_SAMPLE, **options: Any
 ) -> Pool:
     """Plan a pool as `plan_pool` does, but larger in proportion to a large scene's size."""
-    times = _times(prior, represents)
+    prior = dense.sample
+    times = pool_times(dense.total)
+    count = round(count * times)
     if given.rough:
-        return _rough_pool(prior, round(count * times), given.shape)
-    options |= {"size": given.shape, "up": given.up, "seed": given.seed, "represents": represents}
-    return plan_pool(prior, round(count * times), rows=round(rows * times), **options)
+        return _rough_pool(prior, count, given.shape)
+    options |= {"size": given.shape, "up": given.up, "seed": given.seed}
+    return plan_pool(prior, count, rows=round(rows * times), represents=dense.total / len(prior), **options)
 
 
 def _rough_pool(scene: Splats, count: int, size: tuple[int, int]) -> Pool:
@@ -585,10 +574,6 @@ def _rough_pool(scene: Splats, count: int, size: tuple[int, int]) -> Pool:
         return [replace(view, kind=kind) for view in cameras(kind, count)]
 
     return Pool(Cameras.of(cameras("pose", count)), _ROUGH, "", np.array([0.0, 0.0, 1.0]), more=more)
-
-
-def _times(prior: Splats, represents: float) -> float:
-    return pool_times(len(prior) * represents)
 
 
 def pool_times(count: float) -> float:

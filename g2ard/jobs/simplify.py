@@ -8,6 +8,9 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from g2ard.config.checks import check_seed, checks_arguments
 from g2ard.config.choices import FormatName, PointColor, RenderModel
 from g2ard.errors import InputError
@@ -26,7 +29,7 @@ from g2ard.jobs.budget_search import (
 )
 from g2ard.jobs.chosen_points import PointChoice
 from g2ard.jobs.inputs import GivenViews, Views, lifted_cloud, load_scene, say_regions
-from g2ard.pipeline.dense import Dense, InMemory, whole
+from g2ard.pipeline.dense import Dense, InMemory, Merged, whole
 from g2ard.pipeline.presets import configured
 from g2ard.progress import Progress, Say, plural, silent, unsaid
 from g2ard.scene.cameras import Cameras
@@ -76,7 +79,7 @@ class Reduction:
     notes: Sequence[Note] = ()
     progress: Progress = silent
     say: Say = unsaid
-    _made: dict[int, Any] = field(default_factory=dict)
+    _merged: dict[int, Merged] = field(default_factory=dict)
     plan: TilePlan | None = None
 
     def __post_init__(self) -> None:
@@ -110,20 +113,15 @@ class Reduction:
         """Gaussians of the scene."""
         return self.dense.total
 
-    def __call__(self, count: int) -> Any:
-        if count not in self._made:
-            self._made = dict([*self._made.items(), (count, self.made(count))][-2:])
-        return self._made[count]
-
-    def made(self, count: int) -> Any:
-        """Simplify the scene."""
-        return self.dense.merged(
-            count,
-            self.seen if count < self.total else None,
-            self.config,
-            gaps=not self.recovered,
-            progress=self.progress,
-        )
+    def __call__(self, count: int) -> Merged:
+        if count not in self._merged:
+            last = list(self._merged.items())[-1:]
+            seen = self.seen if count < self.total else None
+            small = self.dense.merged(
+                count, seen, self.config, gaps=not self.recovered, progress=self.progress
+            )
+            self._merged = dict([*last, (count, small)])
+        return self._merged[count]
 
     @cached_property
     def seen(self) -> Cameras | None:
@@ -134,13 +132,7 @@ class Reduction:
             return None
         from g2ard.jobs.run_views import cameras_for_weights  # loads planning, which others do not need
 
-        return cameras_for_weights(
-            self.splats,
-            self.given,
-            represents=self.total / len(self.splats),
-            progress=self.progress,
-            say=self.say,
-        )
+        return cameras_for_weights(self.dense, self.given, progress=self.progress, say=self.say)
 
     def warnings(self, small: Splats | PartsStream) -> list[str]:
         """Return warnings about the views, and about regions of a result that is in memory."""
@@ -237,6 +229,16 @@ class Reduction:
         return ResolvedBudget(
             found, file=file, wanted=wanted, renders=renders, cameras=cameras, total=self.total
         )
+
+
+def parents_of(small: Merged, source: Source) -> NDArray[np.int64]:
+    """Return the (N,) new row of each row of a scene, in its file's order; −1 if it was dropped."""
+    if isinstance(small, Simplified):
+        return small.parents
+    from g2ard.tiles.merging import Merged as MergedTiles
+
+    assert isinstance(small, MergedTiles)
+    return small.parents(source.scene)
 
 
 @contextmanager
@@ -366,7 +368,8 @@ def simplify(
     PointChoice(box, where, color).narrow(source, progress)
     with reducing(source, config=config, **inputs) as reduce:
         budget = reduce.resolved(wanted, name, f"scene.{format}")
-        small: Simplified = reduce(budget.count)
+        small = reduce(budget.count)
+    assert isinstance(small, Simplified)  # not in tiles
     say_gaps(small.report.opacity_lost, say)
     if judgement := budget.judge(small.splats):
         say(judgement[1])

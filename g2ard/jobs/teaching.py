@@ -1,19 +1,22 @@
-"""Targets of a command: photos of its views, or renders of a teacher."""
+"""Targets of a command: photos of its views, or renders of the dense scene."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any
 
-from g2ard.config.choices import Colour, RenderModel, is_made
+from g2ard.config.choices import Colour, is_made
 from g2ard.errors import InputError
-from g2ard.io.types import ViewSet
-from g2ard.jobs.inputs import GivenViews, Views, load_scene, load_split_views, make_targets, scorable
-from g2ard.jobs.run_views import shrunk, views_or_pool, within_pixels
+from g2ard.io.exposures import find_exposures
+from g2ard.jobs.inputs import Views, load_split_views, scorable
+from g2ard.jobs.run_views import within_pixels
 from g2ard.jobs.view_checks import check_photos, propose_background, warn_of_sight
-from g2ard.progress import Progress, Say, silent, unsaid
-from g2ard.rendering.targets import Targets
+from g2ard.pipeline.distill import RunViews
+from g2ard.progress import Say, plural, unsaid
+from g2ard.rendering.renderer import RasterSettings
+from g2ard.rendering.targets import Photos, PhotosOrRenders, Targets, TeacherRenders
 from g2ard.scene.cameras import USUAL, Cameras
 from g2ard.scene.splats import Splats
 from g2ard.system.cached import cached_property
@@ -29,101 +32,143 @@ def check_teacher(views: Views | None, teacher: Splats | str | Path | None) -> N
 
 @dataclass(frozen=True, eq=False)
 class Teaching:
-    """Source of targets: photos, or renders of a teacher.
+    """Source of targets: photos, renders of the dense scene, or renders where views have no photo.
 
     Args:
-        teacher: the dense scene, or its path; None if all targets are photos.
+        render: renders the dense scene in some views; None if all targets are photos.
+        photos: whether targets are photos where views have them.
+        background: RGB behind scenes and transparent pixels.
         chosen: whether the user chose the background.
-        photos: use photos where views have them, and renders of the teacher otherwise. Photos that show
-            nothing of the scene are accepted then.
-        render_model: overrides what the teacher's file says.
-        seed: seed of generated views.
-        rough: whether this is for a dry run, see `GivenViews`.
+        insisted: whether photos that show nothing of the scene are accepted.
+        rough: whether this is for a dry run, which looks at no photo for its background.
     """
 
-    teacher: Splats | str | Path | None
+    render: Callable[[Cameras], Targets] | None
+    photos: bool
     background: Colour
     chosen: bool
-    photos: bool = False
-    render_model: RenderModel | None = None
-    seed: int = 0
+    insisted: bool = False
     rough: bool = False
-    progress: Progress = silent
     say: Say = unsaid
 
-    @cached_property
-    def dense(self) -> Splats | None:
-        """The teacher, if there is one."""
-        return None if self.teacher is None else load_scene(self.teacher, self.say, self.render_model)
+    @classmethod
+    def by(
+        cls,
+        teacher: Splats | None,
+        background: Colour,
+        *,
+        chosen: bool,
+        photos: bool,
+        settings: RasterSettings | None = None,
+        rough: bool = False,
+        say: Say = unsaid,
+    ) -> Teaching:
+        """Return the source for commands with a `--teacher`, all whose targets are photos without one.
 
-    def views(self, given: Views | None, student: Splats | None = None) -> Views:
-        """Return the given views, or those found beside the teacher, or generated ones.
-
-        With a student, generated views are those that recover it, see `views_or_pool`.
+        Args:
+            photos: use photos where views have them, also those that show nothing of the scene.
+            settings: conventions of renders.
         """
-        if self.dense is None:
-            assert given is not None  # `check_teacher`
-            return given
-        beside = None if isinstance(self.teacher, Splats) else self.teacher
-        return views_or_pool(
-            self.dense,
-            GivenViews(given, beside, seed=self.seed, rough=self.rough),
-            student=student,
-            progress=self.progress,
-            say=self.say,
-        )
+        render = None
+        if teacher is not None:
+            render = partial(TeacherRenders, teacher, background=background, settings=settings, lazy=True)
+        return cls(render, photos or teacher is None, background, chosen, photos, rough, say)
 
-    def training(self, scene: Splats, views: Views, split: str, size: int | None) -> tuple[ViewSet, Targets]:
-        """Read a split of the views and return it with its targets; reject photos of another scene."""
-        pool, mask = load_split_views(views, split, self.say, unpictured=self.dense is not None)
-        chosen = pool.take(mask).fitted(size)
-        if held_out := chosen.splits.count("test"):
-            count = len(chosen.cameras)
-            self.say(f"split {split}: {held_out} of the {count} views trained on are test views")
-        warn_of_sight(scene, chosen.cameras, self.say)
-        targets = self.targets(chosen.cameras)
-        self.check_photos(scene, chosen.cameras)
-        return chosen, targets
+    def check_photos(self, scene: Splats, cameras: Cameras, *, renders: bool = False) -> None:
+        """Reject photos of another scene, see `g2ard.jobs.view_checks.check_photos`."""
+        if self.photos:
+            insisted = self.insisted
+            check_photos(scene, cameras, self.background, self.say, insisted=insisted, renders=renders)
 
-    def check_photos(self, scene: Splats, cameras: Cameras) -> None:
-        """Reject photos that do not show the scene, unless they are insisted on."""
-        if self.dense is None or self.photos:
-            check_photos(scene, cameras, self.background, self.say, insisted=self.photos)
-
-    def targets(self, cameras: Cameras, **options: Any) -> Targets:
-        """Return the targets of the views; note if another background fits their photos."""
-        if (self.dense is None or self.photos) and not self.rough:
+    def propose_background(self, cameras: Cameras) -> None:
+        """Note if another background fits the photos."""
+        if self.photos and not self.rough:
             propose_background(cameras, self.background, self.chosen, self.say)
-        return self._made(cameras, say=self.say, **options)
 
-    def full_size(self, cameras: Cameras, size: int | None, **options: Any) -> Targets | None:
-        """Return the targets of unshrunk views; None if `size` shrinks none of them.
+    def targets(self, cameras: Cameras, say: Say = unsaid) -> Targets:
+        """Return the targets of views, made on access."""
+        if self.render is not None and not self.photos:
+            return self.render(cameras)
+        exposures = find_exposures(cameras)
+        if exposures:
+            say(f"exposure.json: corrected the exposure of {plural(len(exposures), 'photo')}")
+        if self.render is None:
+            return Photos(cameras, background=self.background, exposures=exposures)
+        return PhotosOrRenders(cameras, self.render, background=self.background, exposures=exposures)
 
-        Of large views there are only some, see `within_pixels`.
+    def full_size(self, cameras: Cameras | None) -> Targets | None:
+        """Return targets of views at their own size, of large views only some (`within_pixels`).
+
+        None without such views.
         """
-        if shrunk(cameras, size) is None:
-            return None
-        return scorable(self._made(within_pixels(cameras), **options))
+        return None if cameras is None else scorable(self.targets(within_pixels(cameras)))
 
-    def held_out(self, views: Views, size: int | None) -> Targets | None:
-        """Return the targets of the test views; None if there are no such views."""
-        cameras = self._split(views, "test")
-        if cameras is None:
-            return None
-        return scorable(self._made(cameras.fitted(size)), self.say)
 
-    def validation(self, views: Views, size: int | None) -> Targets | None:
-        """Return the renders of the views of other kinds in split `val`, or None."""
-        cameras = None if self.dense is None or self.photos else self._split(views, "val")
-        if cameras is None or USUAL in cameras.kinds:
-            return None
-        return self._made(cameras.fitted(size), say=self.say)
+@dataclass(frozen=True, eq=False)
+class RunTargets:
+    """Targets of the views of a run, made on access.
 
-    def _split(self, views: Views, name: str) -> Cameras | None:
-        """Return the views of a split, or None if it is empty."""
-        pool, _ = load_split_views(views, "all", unpictured=self.dense is not None)
-        rows = [i for i, split in enumerate(pool.splits) if split == name]
-        return pool.cameras.take(rows) if rows else None
+    Args:
+        train: those for training.
+    """
 
-    def _made(self, cameras: Cameras, **options: Any) -> Targets:
-        return make_targets(cameras, self.dense, self.background, mixed=self.photos, **options)
+    teaching: Teaching
+    views: RunViews
+    train: Targets
+
+    @classmethod
+    def of(cls, teaching: Teaching, views: RunViews) -> RunTargets:
+        """Return the targets of some views. Notes on the photos for training are the first that are said."""
+        return cls(teaching, views, teaching.targets(views.train.cameras, teaching.say))
+
+    @cached_property
+    def held_out(self) -> Targets:
+        """Those for scoring that have a valid pixel."""
+        say = self.teaching.say
+        return scorable(self.teaching.targets(self.views.test, say), say)
+
+    @cached_property
+    def validation(self) -> Targets | None:
+        """Those that limit recovery, None without such views."""
+        return self._of(self.views.validation)
+
+    @cached_property
+    def apart(self) -> Targets | None:
+        """Those of other kinds for scoring, None without such views."""
+        return self._of(self.views.apart)
+
+    @cached_property
+    def full(self) -> Targets | None:
+        """Held-out targets at the views' own size, None if no size shrank them."""
+        return self.teaching.full_size(self.views.full)
+
+    @cached_property
+    def twice(self) -> Targets | None:
+        """Some of the held-out targets at twice their size, see `RunViews`."""
+        return self._of(self.views.twice)
+
+    def _of(self, cameras: Cameras | None) -> Targets | None:
+        return None if cameras is None else self.teaching.targets(cameras)
+
+
+def read_views(teaching: Teaching, scene: Splats, views: Views, split: str, size: int | None) -> RunViews:
+    """Read views that train in a split; if it is `train`, the splits `test` and `val` score and validate.
+
+    Photos of another scene are rejected. Only renders in views of other kinds validate.
+    """
+    pool, mask = load_split_views(views, split, teaching.say, unpictured=teaching.render is not None)
+    train = pool.take(mask).fitted(size)
+    if held_out := train.splits.count("test"):
+        count = len(train.cameras)
+        teaching.say(f"split {split}: {held_out} of the {count} views trained on are test views")
+    warn_of_sight(scene, train.cameras, teaching.say)
+    teaching.propose_background(train.cameras)
+    teaching.check_photos(scene, train.cameras)
+
+    def others(name: str) -> Cameras:
+        rows = [row for row, word in enumerate(pool.splits) if word == name and split == "train"]
+        return pool.cameras.take(rows).fitted(size)
+
+    validation = others("val")
+    validates = len(validation) and not teaching.photos and USUAL not in validation.kinds
+    return RunViews(train, others("test"), validation if validates else None)

@@ -18,7 +18,7 @@ from g2ard.poses import best_views
 from g2ard.poses.site import Site
 from g2ard.progress import Say, unsaid
 from g2ard.scene.cameras import Camera, Cameras
-from g2ard.scene.samples import evenly_spaced
+from g2ard.scene.samples import take_evenly
 from g2ard.scene.splats import Splats
 from g2ard.scene.transform import change_of_axes, quaternion_of, transform, unit_up, up_in
 from g2ard.stages.recover.anchors import measure_prior
@@ -156,7 +156,7 @@ def backdrop(given: Colour | None, scenes: Sequence[Splats], *, of_points: bool 
     """
     if given is not None or of_points:
         return given
-    samples = (scene.take(np.array(evenly_spaced(len(scene), _SAMPLE, floor=True))) for scene in scenes)
+    samples = (take_evenly(scene, _SAMPLE, floor=True) for scene in scenes)
     return None if any(measure_prior(sample).is_lift for sample in samples) else BLACK
 
 

@@ -36,8 +36,9 @@ class RunViews:
 
     Args:
         train: views for training, of the usual and other kinds.
-        test: usual views for scoring.
-        apart: views of other kinds; None if there are none.
+        test: usual views for scoring, or all views for scoring that are given.
+        validation: views of other kinds that limit recovery's changes; None if there are none.
+        apart: further views of other kinds, for scoring.
         pool: the whole generated pool, written beside the result.
         full: the usual views for scoring at their own size, if a requested size shrank them.
         unseen: share of the sampled matter that no view of the pool sees.
@@ -49,6 +50,7 @@ class RunViews:
 
     train: ViewSet
     test: Cameras
+    validation: Cameras | None = None
     apart: Cameras | None = None
     pool: ViewSet | None = None
     unseen: float | None = None
@@ -57,10 +59,20 @@ class RunViews:
     guess: str | None = None
     merging: Cameras | None = None
 
+    @property
+    def untrained(self) -> list[Cameras]:
+        """Views that need a target, but do not train."""
+        return [cameras for cameras in (self.test, self.validation, self.apart) if cameras is not None]
+
     def resized(self, longest: int) -> RunViews:
         """Shrink all views for training and scoring."""
-        apart = self.apart and self.apart.resized(longest)
-        return replace(self, train=self.train.resized(longest), test=self.test.resized(longest), apart=apart)
+        return replace(
+            self,
+            train=self.train.resized(longest),
+            test=self.test.resized(longest),
+            validation=self.validation and self.validation.resized(longest),
+            apart=self.apart and self.apart.resized(longest),
+        )
 
 
 __all__ = ["DistillConfig", "Distilled", "SelectConfig", "distill"]

@@ -14,7 +14,7 @@ from g2ard.poses.site import Site
 from g2ard.poses.within import WIDE, closed, is_room, plan_inside, plan_sharp, plan_walk
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.reproducible import Floats, around, between, canonical_order, halton, turned
-from g2ard.scene.samples import evenly_spaced
+from g2ard.scene.samples import take_evenly
 from g2ard.scene.splats import Splats
 
 _ROWS = 150_000
@@ -287,7 +287,7 @@ def _create_survey(splats: Splats, size: tuple[int, int], axis: ArrayLike | None
 def _find_best(survey: Survey, count: int, cameras: Cameras | None) -> tuple[Cameras, str]:
     """Return the best views, and where they are: "photos", "within" or "around"."""
     if cameras is not None:
-        look = Outlook.of(survey, cameras.take(evenly_spaced(len(cameras), _PHOTOS)))
+        look = Outlook.of(survey, take_evenly(cameras, _PHOTOS))
         return look.cameras.take(
             _choose(look, look.detail * _measure_wholeness(survey, look), count)
         ), "photos"

@@ -8,7 +8,7 @@ import numpy as np
 
 from g2ard.scene.cameras import ZOOM, Camera, Cameras
 from g2ard.scene.reproducible import Floats, along, halton
-from g2ard.scene.samples import evenly_spaced, spread
+from g2ard.scene.samples import spread, take_evenly
 from g2ard.scene.splats import Splats
 
 _TIMES = 2.0
@@ -38,7 +38,7 @@ def zoomed(scene: Splats, cameras: Cameras, *, represents: float = 1.0, share: f
     Returns:
         The views, in the same order; zooms are of the kind "zoom".
     """
-    some = scene.take(np.array(evenly_spaced(len(scene), _SAMPLE)))
+    some = take_evenly(scene, _SAMPLE)
     some = some.take(some.opacities > _SOLID)
     points = some.means.astype(np.float64) + some.offset
     axes = np.sort(some.scales.astype(np.float64), axis=1)

@@ -13,7 +13,7 @@ import g2ard._core as _core
 from g2ard.progress import Progress, silent
 from g2ard.rendering.renderer import RasterSettings, View, arrays_of, centred, settings_for, view_of
 from g2ard.scene.cameras import Cameras
-from g2ard.scene.samples import evenly_spaced
+from g2ard.scene.samples import take_evenly
 from g2ard.scene.splats import SH_C0, Splats
 from g2ard.system.threads import in_threads
 
@@ -54,7 +54,7 @@ def recoloured(dense: Splats, small: Splats, views: Cameras, progress: Progress 
 
 def seen_by(views: Cameras) -> Cameras:
     """Return the views to which colours are fitted."""
-    return views.take(evenly_spaced(len(views), _VIEWS))
+    return take_evenly(views, _VIEWS)
 
 
 def shifted(

@@ -15,7 +15,7 @@ from g2ard.progress import Progress, counter, silent
 from g2ard.rendering.renderer import RasterSettings, arrays_of, centred, settings_for, view_of
 from g2ard.scene.cameras import USUAL, Cameras, rows_by_kind
 from g2ard.scene.prepared import as_prepared
-from g2ard.scene.samples import evenly_spaced
+from g2ard.scene.samples import evenly_spaced, take_evenly
 from g2ard.scene.splats import Splats
 
 MOST_VIEWS = 96
@@ -154,7 +154,7 @@ class _Sampler:
     def __init__(self, cameras: Cameras, longest: int, progress: Progress) -> None:
         usual, others = usual_and_others(cameras)
         self.others = others.resized(longest)
-        full = usual.take(evenly_spaced(len(usual), MOST_VIEWS))
+        full = take_evenly(usual, MOST_VIEWS)
         self.views = full.resized(longest)
         self.shrunk = np.float32((self.views.widths / full.widths).mean())
         self.used: list[range] | None = None  # until the first scene decides it

@@ -21,7 +21,7 @@ from g2ard.rendering.sky import over_sky, seen_on_sky
 from g2ard.rendering.targets import Targets, mask_of
 from g2ard.report.labels import DENSE, RESULT, TARGET, label_scenes
 from g2ard.report.page import Page, Shown
-from g2ard.report.run import COLUMNS, LOST, KindScore, RunReport, list_rows
+from g2ard.report.run import COLUMNS, LOST, KindScore, RunReport, list_remarks, list_rows
 from g2ard.report.sheet import draw_contact_sheet
 from g2ard.scene.cameras import Camera, Cameras, rows_by_kind
 from g2ard.scene.splats import Splats
@@ -142,7 +142,6 @@ def write_distill_report(
     renderers: Mapping[str, Renderer],
     drawn: Drawn,
     report: RunReport,
-    told: Sequence[str] = (),
     *,
     best: Pictures,
     on_white: Lit | None = None,
@@ -155,7 +154,6 @@ def write_distill_report(
     Args:
         renderers: of the scenes in pictures by name, the result last.
         drawn: its parts are the targets of the held-out views, and of the views of other kinds, if any.
-        told: summary lines that the command prints.
         best: a view that shows most of the scene.
         on_white: see `draw_pictures`.
         command: the command line of the run.
@@ -193,7 +191,7 @@ def write_distill_report(
     page.paragraph(f"PSNR and SSIM: {report.stages}, in views of {report.size}{below}.")
     if edges := describe_edges(report.kinds):
         page.paragraph(edges)
-    for line in told:
+    for line in list_remarks(report):
         page.paragraph(line, warns=line.startswith("warning"))
     lost = _find_worsened(before, after)
     if lost:

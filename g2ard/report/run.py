@@ -5,21 +5,39 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
+from itertools import chain
 from statistics import fmean
 from typing import Any
 
 from g2ard.io.reports import LEFT_OUT, Report
+from g2ard.io.scene_formats import scene_format
 from g2ard.progress import plural
 from g2ard.rendering.metrics import METRICS
 from g2ard.report.labels import RESULT
 from g2ard.scene.cameras import USUAL, rows_by_kind
 from g2ard.stages.evaluate import Evaluation, Means, Scores, ViewScore
 from g2ard.stages.recover.anchors import PriorMeasures
-from g2ard.stages.recover.report import RecoverReport
+from g2ard.stages.recover.report import (
+    RecoverReport,
+    describe_idle_regularizers,
+    describe_outcome,
+    describe_time_limit,
+)
+from g2ard.stages.simplify.gaps import RECOVERED_GAPS, gaps_line
 from g2ard.stages.simplify.reduce import SimplifyReport
 
 LOST = 0.05
-"""Loss of a view in dB that counts."""
+"""Loss of a view, or of the mean of views, in dB that counts."""
+_LOST_SSIM = 0.001
+"""Loss of SSIM that counts."""
+_HARMFUL_SIZE = 3.0
+"""Loss in dB at the views' own size, against that of training, above which --size is warned of."""
+_LEAST_UNSEEN = 0.005
+"""Share of the scene that counts if no view sees it."""
+WARNED_FORMAT_LOSS = 1.0
+"""Loss in dB by a file format that is worth a warning."""
+_INVISIBLE_LOSS_PSNR = 45.0
+"""PSNR in dB above which nobody sees a loss."""
 
 
 @dataclass(frozen=True)
@@ -264,6 +282,13 @@ class RunReport(Report):
         return f"{start}{file:.2f} MB as .{self.packed.file.partition('.')[2]}"
 
     @property
+    def counts(self) -> str:
+        """Counts, sizes and times."""
+        seconds = {name: value for name, value in self.seconds.items() if name != "resumed"}
+        times = ", ".join(f"{name} {value:.1f} s" for name, value in seconds.items())
+        return f"{self.title}, {self.sizes}; {times}"
+
+    @property
     def stages(self) -> str:
         """Names of the scenes that are scored before and after."""
         return f"{'start' if self.photos else 'simplified'} → {RESULT}"
@@ -288,3 +313,91 @@ class RunReport(Report):
         if self.photos or self.lifted:
             return f"{plural(self.output_count, 'Gaussian')} from {self.source}"
         return f"{self.output_count:,} of {plural(self.input_count, 'Gaussian')}"
+
+
+def list_remarks(report: RunReport, *, verbose: bool = False) -> list[str]:
+    """Return lines on recovery, losses, unseen parts and packing; `verbose` adds idle regularisers."""
+    rounds = [entry.recover for entry in report.rounds]
+    recoveries = list(chain.from_iterable(rounds))
+    lines = _compare_own_size(report)
+    lines += map(describe_outcome, recoveries)
+    if rounds and rounds[-1]:
+        lines.append(describe_time_limit(recoveries[-1]))
+    for entry in rounds:
+        if entry and entry[-1].exposure:
+            lines.append(str(entry[-1].exposure))
+    if verbose:
+        lines.append(describe_idle_regularizers(rounds))
+    start = "start" if report.photos else "simplified scene"
+    lines += [
+        describe_loss(kind, f"the {start} is better there (--keep writes it too)") for kind in report.kinds
+    ]
+    lines.append(gaps_line(report.opacity_lost, RECOVERED_GAPS))
+    if report.unseen and report.unseen > _LEAST_UNSEEN:
+        lines.append(f"{report.unseen:.0%} of the scene is in no view: simplified but not recovered")
+    lines += report.warnings or ()
+    if report.packed:
+        size = report.bytes["file"] or 0
+        lines += score_lines(report.packed, size, report.scores["recovered"].psnr, report.size)
+    return [line for line in lines if line is not None]
+
+
+def _compare_own_size(report: RunReport) -> list[str | None]:
+    """Return the scores at the views' own size, if they were measured, and whether --size did harm."""
+    if not report.own_size:
+        return []
+    before, after = (report.own_size[name] for name in ("simplified", "recovered"))
+    lines: list[str | None] = [
+        f"at the views' own size ({after.scored_in}): {before.psnr:.2f} → {after.psnr:.2f} dB, "
+        f"SSIM {before.ssim:.4f} → {after.ssim:.4f}"
+    ]
+    lost = report.scores["recovered"].psnr - after.psnr
+    if lost > _HARMFUL_SIZE:
+        lines.append(
+            f"warning: the result is {lost:.1f} dB worse at the views' own size than at --size; "
+            "leave --size out, or give a larger one"
+        )
+    return lines
+
+
+def describe_loss(kind: KindScore, hint: str) -> str | None:
+    """Describe what recovery lost in the views of a kind, if anything; `hint` ends a warning."""
+    psnr = kind.psnr.gain
+    change = kind.change("ssim")
+    ssim = change.gain if change else 0.0
+    if ssim < -_LOST_SSIM and psnr > 0:  # neither scene is better
+        return f"recovery lost {-ssim:.3f} SSIM and gained {psnr:.2f} dB in {kind.kind} views"
+    lost = f"{kind.lost} of {kind.views}"
+    if psnr < -LOST or ssim < -_LOST_SSIM:
+        how = f"{-psnr:.2f} dB" if psnr < -LOST else f"{-ssim:.3f} SSIM"
+        where = f"{lost} views lost PSNR"
+        if kind.worst_psnr.gain < 0:
+            where = f"worst view {kind.worst}: {kind.worst_psnr.before:.2f} → {kind.worst_psnr.after:.2f} dB"
+        return f"warning: recovery lost {how} in {kind.kind} views ({where}); {hint}"
+    if not kind.lost:
+        return None
+    how = "gained" if psnr > 0 else "lost"
+    return f"{lost} {kind.kind} views lost PSNR; the mean of all {kind.views} {how} {abs(psnr):.2f} dB"
+
+
+def score_lines(packed: Packed, size: int, unpacked: float, pixels: str) -> list[str]:
+    """Return a packed file's size in bytes and score beside that of the unpacked scene, and a warning if its
+    loss is large and visible. `pixels` is the size of the views.
+
+    >>> score_lines(Packed("scene.sog", 37.86, 0.9), 1_310_000, 37.94, "800×600 px")
+    ['scene.sog: 1.31 MB, 37.9 dB in held-out views, 800×600 px (37.9 as .ply)']
+    >>> len(score_lines(Packed("scene.sog", 58.6, 0.9), 1_310_000, 62.6, "800×600 px"))
+    1
+    """
+    name = packed.file
+    lost = unpacked - packed.psnr
+    scores = f"{packed.psnr:.1f} dB in held-out views, {pixels} ({unpacked:.1f} as .ply)"
+    lines = [f"{name}: {size / 1e6:.2f} MB, {scores}"]
+    if lost > WARNED_FORMAT_LOSS and packed.psnr < _INVISIBLE_LOSS_PSNR:
+        lines.append(f"warning: {name}: the format costs {lost:.1f} dB; {better_format(name)}")
+    return lines
+
+
+def better_format(name: str) -> str:
+    """Name formats that lose less than that of a file."""
+    return ".ply loses nothing" if scene_format(name).loss == 1 else ".sog loses less, .ply nothing"

@@ -1,9 +1,12 @@
-"""Evenly spaced indices, and weighted quantiles."""
+"""Evenly spaced indices and samples, and weighted quantiles."""
 
-from typing import Any
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
+
+T = TypeVar("T")
+T_co = TypeVar("T_co", covariant=True)
 
 
 def evenly_spaced(count: int, most: int, *, floor: bool = False) -> list[int]:
@@ -17,6 +20,18 @@ def evenly_spaced(count: int, most: int, *, floor: bool = False) -> list[int]:
     spaced = np.linspace(0, count - 1, min(count, most))
     indices: list[int] = np.unique((np.floor if floor else np.round)(spaced).astype(int)).tolist()
     return indices
+
+
+class Rows(Protocol[T_co]):
+    """What has rows, such as Gaussians or views."""
+
+    def __len__(self) -> int: ...
+    def take(self, index: NDArray[np.int64], /) -> T_co: ...
+
+
+def take_evenly(rows: Rows[T], most: int, *, floor: bool = False) -> T:
+    """Return at most `most` Gaussians or views, see `evenly_spaced`."""
+    return rows.take(np.array(evenly_spaced(len(rows), most, floor=floor), np.int64))
 
 
 def spread(count: int) -> NDArray[np.int64]:

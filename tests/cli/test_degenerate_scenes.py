@@ -43,7 +43,7 @@ def test_a_notebook_shows_a_degenerate_scene(name: str) -> None:
 
 PICTURES = {
     "distill": {
-        "g2ard.jobs.distill.DistillJob.best": ("choosing views", ("report.html", "preview.png", "view.html")),
+        "g2ard.jobs.scoring.best_targets": ("choosing views", ("report.html", "preview.png", "view.html")),
         "g2ard.report.distilled.write_distill_report": ("report.html", ("report.html",)),
         "g2ard.report.distilled.write_preview": ("preview.png", ("preview.png",)),
         "g2ard.cli.run_folder.frame_with": ("view.html", ("view.html",)),

@@ -21,7 +21,7 @@ from helpers.photos import photographed
 from helpers.scenes import around, checkered_ball
 
 SLOW = {
-    "distill": ("g2ard.jobs.distill.prepare", "g2ard.jobs.distill.DistillJob.run"),
+    "distill": ("g2ard.jobs.distill.prepare", "g2ard.jobs.distill_job.DistillJob.run"),
     "clean": ("g2ard.jobs.clean.clean",),
     "lod": ("g2ard.jobs.levels.lod",),
     "register": ("g2ard.stages.register.register",),
@@ -72,7 +72,7 @@ def test_a_run_whose_scores_failed_is_resumed(
     folder = shutil.copytree(inputs, tmp_path / "inputs")
     ask = ("distill", "ball.ply", "-r", 8, "--steps", 2, "--views", "views.json", "--no-page", "-o", "run")
     ask = (*ask, "--focus", "far")
-    with stages_after(folder / "run" / "scene.ply", failing="g2ard.jobs.distill.DistillJob.report"):
+    with stages_after(folder / "run" / "scene.ply", failing="g2ard.jobs.scoring.describe_run"):
         line = refused(command_line, folder, *ask, "-q", status=1)
     assert line == (
         f"g2ard: scoring failed: {INJECTED}; run/scene.ply is written; "

@@ -12,7 +12,8 @@ import pytest
 
 from g2ard.errors import InputError
 from g2ard.io import write_splats, write_views
-from g2ard.jobs.distill import DistillJob
+from g2ard.jobs import scoring
+from g2ard.jobs.distill_job import DistillJob
 from g2ard.pipeline.distill import Distilled
 from g2ard.rendering.targets import TeacherRenders
 from g2ard.stages.recover import checkpoint
@@ -85,7 +86,7 @@ def test_a_recovered_run_renders_only_views_that_are_scored(
     folder: Path, command_line: CommandLine, monkeypatch: pytest.MonkeyPatch, options: tuple[str, ...]
 ) -> None:
     rendered: list[str] = []
-    make, score = TeacherRenders._make, DistillJob.report
+    make, score = TeacherRenders._make, scoring.describe_run
 
     def counting(self: TeacherRenders, view: int) -> Any:
         rendered.append(self.cameras.names[view])
@@ -99,9 +100,9 @@ def test_a_recovered_run_renders_only_views_that_are_scored(
     ask = ("distill", "a.ply", "-r", 2, "--steps", 3, "--size", 24, "--no-page", *options)
     succeeds(command_line, folder, *ask, "-o", "whole")
     every = set(rendered)
-    monkeypatch.setattr(DistillJob, "report", stopped)
+    monkeypatch.setattr(scoring, "describe_run", stopped)
     assert command_line(*ask, "-o", "run", cwd=folder)[0] == 130
-    monkeypatch.setattr(DistillJob, "report", score)
+    monkeypatch.setattr(scoring, "describe_run", score)
     rendered.clear()
     succeeds(command_line, folder, *ask, "-o", "run", "--resume")
     report = json.loads((folder / "run" / "report.json").read_text())

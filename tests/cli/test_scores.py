@@ -175,7 +175,7 @@ def test_every_score_has_its_size(runs: Path, command_line: CommandLine) -> None
 
 def test_a_size_that_harms_is_a_warning_with_the_way_out() -> None:
     """A loss above 3 dB at the views' own size is reported; a smaller one is not."""
-    from g2ard.cli.run_result import list_remarks
+    from g2ard.report.run import list_remarks
 
     means = [
         SimpleNamespace(psnr=psnr, ssim=0.9, scored_in="8 photos, 800×600 px")

@@ -30,7 +30,7 @@ _IMPORTERS = [
     *("g2ard.jobs.run_views", "benchmarks.views", "benchmarks.kinds.select"),
 ]
 """Modules that have `plan_pool`."""
-_SHOWING = ["g2ard.jobs.run_views", "g2ard.jobs.notebook", "g2ard.jobs.viewer_frame", "g2ard.jobs.distill"]
+_SHOWING = ["g2ard.jobs.run_views", "g2ard.jobs.notebook", "g2ard.jobs.viewer_frame", "g2ard.jobs.scoring"]
 """Modules that have `best_views`."""
 _MOST = 100
 """Plans that are kept in memory."""

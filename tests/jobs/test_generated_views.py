@@ -12,6 +12,7 @@ from g2ard.io import write_views
 from g2ard.io.types import ViewSet
 from g2ard.jobs.distill_options import DistillOptions
 from g2ard.jobs.run_views import _twice, views_of
+from g2ard.pipeline.dense import InMemory
 from g2ard.pipeline.distill import RunViews, draw_weights
 from g2ard.poses import plan_pool
 from g2ard.rendering.visibility import visibility_source
@@ -61,7 +62,7 @@ def test_views_are_made_where_none_are_given(command_line: CommandLine, folder: 
 def test_views_of_other_kinds_join_the_usual_ones(make, focus: str | None, kinds: set[str]) -> None:
     scene = make()
     options = DistillOptions(views="made", settings={"focus": focus, "schedule": "best"})
-    views = views_of(scene, options, len(scene) // 10)
+    views = views_of(InMemory(scene), options, len(scene) // 10)
     rows = rows_by_kind(views.train.cameras.kinds)
     assert set(rows) <= kinds
     assert len(rows["usual"]) == (224 if make is naive.room else 112)
@@ -87,7 +88,7 @@ def test_runs_with_a_focus_are_scored_in_the_views_of_others(focus: str) -> None
     """So their scores can be compared, and none of the views trains the other run."""
     statue = naive.statue()
     plain, focused = (
-        views_of(statue, DistillOptions(views="made", settings={"focus": kind, "steps": 1400}), 300)
+        views_of(InMemory(statue), DistillOptions(views="made", settings={"focus": kind, "steps": 1400}), 300)
         for kind in (None, focus)
     )
     np.testing.assert_array_equal(focused.test.viewmats, plain.test.viewmats)
@@ -120,7 +121,7 @@ def test_given_views_stay_first(tmp_path: Path) -> None:
     statue = naive.statue()
     write_views(tmp_path / "views.json", plan_pool(statue, 16).cameras)
     views = [
-        views_of(statue, DistillOptions(views=tmp_path / "views.json", settings=settings), 500)
+        views_of(InMemory(statue), DistillOptions(views=tmp_path / "views.json", settings=settings), 500)
         for settings in ({"focus": "far"}, {"focus": "anywhere", "focus_share": 0.25})
     ]
     plain, mixed = (found.train.cameras for found in views)
@@ -144,7 +145,9 @@ def test_crowded_views_have_their_weights_whatever_joins(crowded: int, focus: st
 
     def found(focus: str | None, **settings: object) -> ViewSet:
         views = ViewSet(given, splits=("train",) * (len(given) - 1) + ("test",))
-        return views_of(room, DistillOptions(views=views, settings={"focus": focus, **settings}), 300).train
+        return views_of(
+            InMemory(room), DistillOptions(views=views, settings={"focus": focus, **settings}), 300
+        ).train
 
     alone, mixed = found("far"), found(focus)
     usual = len(alone.cameras)
@@ -165,7 +168,7 @@ def test_runs_of_few_steps_use_few_views() -> None:
     scene = naive.statue()
 
     def made(**recover: object) -> RunViews:
-        return views_of(scene, DistillOptions(views="made", settings=recover), len(scene) // 10)
+        return views_of(InMemory(scene), DistillOptions(views="made", settings=recover), len(scene) // 10)
 
     whole, fast, few = made(schedule="best"), made(schedule="fast"), made(steps=20)
     counts = [len(views.train.cameras) for views in (whole, fast, few)]
@@ -176,7 +179,8 @@ def test_runs_of_few_steps_use_few_views() -> None:
     ]
     assert len(usual[2] & usual[1]) > 0.6 * len(usual[2])  # a zoom stands where its view stood
     assert [len(views.test) for views in (whole, fast, few)] == [16, 6, 6]
-    assert [len(views.apart or ()) for views in (whole, fast, few)] == [48, 24, 24]
+    assert [len(views.apart or ()) for views in (whole, fast, few)] == [24, 12, 12]
+    assert [len(views.validation or ()) for views in (whole, fast, few)] == [24, 12, 12]
 
 
 def test_a_few_views_are_scored_at_twice_their_size(command_line: CommandLine, folder: Path) -> None:

@@ -7,8 +7,7 @@ from pathlib import Path
 import numpy as np
 
 import g2ard
-from g2ard.jobs.format_loss import score_lines
-from g2ard.report.run import Packed
+from g2ard.report.run import Packed, score_lines
 from helpers.commands import CommandLine, succeeds
 from helpers.scenes import checkered_ball
 

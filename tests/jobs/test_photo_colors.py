@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 
 from g2ard.io.types import Points
-from g2ard.jobs.distill import _points
+from g2ard.jobs.start import _as_cloud
 from g2ard.progress import unsaid
 from g2ard.scene.cameras import Camera, Cameras
 from g2ard.stages.photo_points.colors import colored, median_colors
@@ -60,8 +60,7 @@ def test_black_points_are_those_without_a_colour(tmp_path: Path) -> None:
     positions = np.concatenate([rng.uniform(-1, 1, (900, 3)) * (1, 0, 1), [[0, 50.0, 0], [0.05, 0, 0.05]]])
     colors = np.zeros((902, 3), np.float32)
     colors[-1] = 1
-    cloud, _, _ = _points(Points(positions, colors), Cameras.of(views), unsaid)
-    assert cloud is not None
+    cloud = _as_cloud(Points(positions, colors))
     found = colored(cloud, Cameras.of(views), "cloud", say=unsaid).colors
     np.testing.assert_array_equal(found[-1], 1)
     np.testing.assert_allclose(found[:-1], np.tile(np.divide((200, 40, 10), 255), (901, 1)), atol=1e-3)

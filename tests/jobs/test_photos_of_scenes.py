@@ -81,6 +81,5 @@ def test_a_job_uses_photos_over_renders_where_it_has_both(kind: str, tmp_path: P
         "both": replace(pictured, image_paths=(*pictured.image_paths[:6], *[None] * 6)),
     }[kind]
     job = prepare(BALL, Budget(300), DistillOptions(views=views))
-    assert job.photos_over_renders == (kind == "both")
-    assert job.reads_photos == (kind != "renders")
+    assert job.teaching.photos == (kind != "renders")
     assert (not job.renders) == (kind == "photos")

@@ -53,7 +53,7 @@ def test_a_generated_pool_is_completed_for_the_student(folder: Path) -> None:
     """Views of other kinds train, validate and are scored, and more views get more steps, as in `distill`."""
     student = g2ard.simplify(naive.statue(), ratio=10, method="fast").splats
     job = prepare(student, views="made", teacher=naive.statue(), size=32)
-    kinds = job.views.cameras.kinds
+    kinds = job.targets.train.cameras.kinds
     assert kinds.count("usual") == 112
     assert {"usual"} < set(kinds)
     assert job.validation is not None
@@ -61,10 +61,10 @@ def test_a_generated_pool_is_completed_for_the_student(folder: Path) -> None:
     assert job.held_out is not None
     assert job.held_out.cameras.kinds.count("usual") == 16
     assert set(job.validation.cameras.kinds) <= set(job.held_out.cameras.kinds)
-    assert job.config.steps == count_steps_for_renders(student, job.views.cameras, 800)
-    names = [*job.views.cameras.names, *job.validation.cameras.names, *job.held_out.cameras.names]
+    assert job.config.steps == count_steps_for_renders(student, job.targets.train.cameras, 800)
+    names = [*job.targets.train.cameras.names, *job.validation.cameras.names, *job.held_out.cameras.names]
     assert len(set(names)) == len(names)
-    given = prepare(student, views=job.views, teacher=naive.statue(), size=32)
+    given = prepare(student, views=job.targets.views.train, teacher=naive.statue(), size=32)
     assert given.validation is None
 
 

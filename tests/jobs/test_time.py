@@ -9,7 +9,7 @@ import pytest
 
 from g2ard import save
 from g2ard.errors import InputError
-from g2ard.jobs import distill as jobs
+from g2ard.jobs import distill_job as jobs
 from g2ard.jobs.budget import Budget
 from g2ard.jobs.distill import prepare
 from g2ard.jobs.distill_options import DistillOptions

@@ -105,8 +105,7 @@ def test_command_on_a_trained_scene(command_line: CommandLine, tmp_path: Path) -
 
 
 def test_a_loss_in_any_kind_of_view_is_reported() -> None:
-    from g2ard.cli.run_result import describe_loss, list_remarks
-    from g2ard.report.run import RunReport, summarize_by_kind
+    from g2ard.report.run import RunReport, describe_loss, list_remarks, summarize_by_kind
     from g2ard.stages.evaluate import ViewScore
 
     def said(usual: float, near: float | None, unseen: float | None, ssim: float = 0.0) -> list[str]:
@@ -127,7 +126,8 @@ def test_a_loss_in_any_kind_of_view_is_reported() -> None:
     assert mixed == "recovery lost 0.004 SSIM and gained 0.30 dB in usual views"
     assert said(0.0, None, 0.0, ssim=-0.004)[0].startswith("warning: recovery lost 0.004 SSIM")
     before = [ViewScore(15.0, name="a"), ViewScore(30.0, name="b")]
-    line = describe_loss(summarize_by_kind(before, [ViewScore(15.5, name="a"), ViewScore(29.0, name="b")])[0])
+    after = [ViewScore(15.5, name="a"), ViewScore(29.0, name="b")]
+    line = describe_loss(summarize_by_kind(before, after)[0], "")
     assert "recovery lost 0.25 dB in usual views (1 of 2 views lost PSNR)" in line  # the worst view gained
     lines = said(-0.2, -0.3, 0.25)
     assert "lost 0.20 dB in usual views" in lines[0]

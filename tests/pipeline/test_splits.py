@@ -57,8 +57,9 @@ class Watch:
 
 @pytest.fixture
 def watch(monkeypatch: pytest.MonkeyPatch) -> Watch:
-    import g2ard.jobs.distill
+    import g2ard.jobs.levels
     import g2ard.jobs.recover
+    import g2ard.jobs.scoring
     import g2ard.pipeline.dense
     import g2ard.pipeline.steps
     import g2ard.stages.evaluate
@@ -79,7 +80,7 @@ def watch(monkeypatch: pytest.MonkeyPatch) -> Watch:
     watched(g2ard.jobs.recover, "optimize", 1, seen.trained)
     watched(g2ard.pipeline.steps, "recover", 1, seen.trained)
     watched(g2ard.pipeline.dense, "visibility_source", 0, seen.looked)
-    for module in (g2ard.stages.evaluate, g2ard.jobs.distill, g2ard.jobs.recover):
+    for module in (g2ard.stages.evaluate, g2ard.jobs.scoring, g2ard.jobs.levels, g2ard.jobs.recover):
         watched(module, "evaluate", 1, seen.scored)
     return seen
 

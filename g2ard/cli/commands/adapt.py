@@ -43,7 +43,8 @@ def adapt(
 ) -> None:
     """Refit colours and opacities to new images; means, rotations and scales stay fixed."""
     from g2ard.jobs.cost import cost_of_recovery
-    from g2ard.jobs.teaching import Teaching
+    from g2ard.jobs.inputs import load_scene
+    from g2ard.jobs.teaching import Teaching, read_views
     from g2ard.pipeline.adapt import AdaptConfig
     from g2ard.pipeline.adapt import adapt as refit
 
@@ -59,21 +60,21 @@ def adapt(
     splats = run.load(compact)
     if output != opt.UNWRITTEN:
         check_positions(output, splats)
-    teaching = Teaching(
-        teacher,
+    dense = None if teacher is None else load_scene(teacher, run.say, run.render_model)
+    teaching = Teaching.by(
+        dense,
         config.background,
         chosen=background is not None,
         photos=photos,
-        render_model=run.render_model,
-        seed=run.seed,
         rough=dry_run,
-        **run.callbacks,
+        say=run.say,
     )
-    _, targets = teaching.training(splats, opt.with_images(views, images, alpha), split, size)
+    given = read_views(teaching, splats, opt.with_images(views, images, alpha), split, size)
+    targets = teaching.targets(given.train.cameras, run.say)
     count = len(targets.cameras)
     most = config.most_steps(count)
     first = config.stretches(count)[0]
-    cost = cost_of_recovery(splats, targets.cameras, most, teacher=teaching.dense)
+    cost = cost_of_recovery(splats, targets.cameras, most, teacher=dense)
     if dry_run:
         tell_plan(run, len(splats), cost)
         return

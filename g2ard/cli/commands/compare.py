@@ -137,7 +137,7 @@ def _name_closer(
     """
     from g2ard.errors import InputError
     from g2ard.jobs.comparison import better_line, common_of, is_run, source_of
-    from g2ard.jobs.inputs import load_views, scorable
+    from g2ard.jobs.inputs import load_scene, load_views, scorable
     from g2ard.jobs.teaching import Teaching
     from g2ard.stages.evaluate import evaluate
 
@@ -151,9 +151,11 @@ def _name_closer(
     except InputError as error:
         return f"cannot say which is closer to their dense scene: {error}"
     assert common is not None
-    teaching = Teaching(common.teacher, colour, True, common.photos, **run.callbacks)
-    cameras = load_views(common.views, "test", common.size, unpictured=teaching.dense is not None)
-    targets = scorable(teaching.targets(cameras))
+    source = None if common.teacher is None else load_scene(common.teacher, run.say)
+    teaching = Teaching.by(source, colour, chosen=True, photos=common.photos, say=run.say)
+    cameras = load_views(common.views, "test", common.size, unpictured=source is not None)
+    teaching.propose_background(cameras)
+    targets = scorable(teaching.targets(cameras, run.say))
     scores = [
         evaluate(splats, targets, background=colour, progress=run.progress) for splats in (dense, other)
     ]

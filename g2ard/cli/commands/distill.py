@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -11,7 +11,7 @@ from g2ard.cli import options as opt
 from g2ard.cli.command import command
 from g2ard.cli.outputs import read_budget, refuse_file
 from g2ard.cli.run import Run
-from g2ard.cli.run_result import list_remarks, say_fit, tell_plan, tell_run
+from g2ard.cli.run_result import say_fit, tell_plan, tell_run
 from g2ard.cli.work_folder import drop_work, read_tiling, work_folder
 from g2ard.config.choices import is_made
 from g2ard.io import Source
@@ -98,6 +98,7 @@ def distill(
     from g2ard.jobs.cost import check_job_memory, cost_of
     from g2ard.jobs.distill import preparing
     from g2ard.jobs.distill_options import DistillOptions
+    from g2ard.jobs.scoring import best_targets, describe_run
     from g2ard.jobs.tile_options import is_tiled
     from g2ard.pipeline.config import DistillConfig
     from g2ard.report.distilled import Drawn
@@ -150,18 +151,16 @@ def distill(
         check_job_memory(job, tiling.memory, cost.bytes)
         name = scene or Path(str(views))
         with folder.hold(job):
-            done: Any = job.run(folder.unfinished)
+            done = job.run(folder.unfinished)
             folder.write(done, job.views, job.targets)
             drawn = None
             line = ""
             with run.showing("choosing views for report.html"):
-                drawn = Drawn(job.best(done), list(filter(None, (done.held_out, job.targets.apart))))
+                drawn = Drawn(best_targets(job, done), list(filter(None, (done.held_out, job.targets.apart))))
             with run.finishing("scoring"):
-                report: Any = job.report(done, folder.scene, drawn)
+                report = describe_run(job, done, folder.scene, drawn)
             if drawn is not None:
-                report, line = folder.write_pages(
-                    source or name, job, done, report, list_remarks(report), drawn
-                )
+                report, line = folder.write_pages(source or name, job, done, report, drawn)
             folder.write_report(report)
     tell_run(run, name, job, done, report, folder, line)
 

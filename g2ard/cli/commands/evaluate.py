@@ -83,7 +83,8 @@ def evaluate(
     """
     from g2ard.io.describe import bytes_of
     from g2ard.jobs.comparison import better_line, common_of
-    from g2ard.jobs.inputs import load_views, scorable
+    from g2ard.jobs.inputs import GivenViews, load_scene, load_views, scorable
+    from g2ard.jobs.run_views import shrunk, views_or_pool
     from g2ard.jobs.teaching import Teaching, check_teacher
     from g2ard.jobs.view_checks import check_sight
     from g2ard.rendering.metrics import load_lpips
@@ -116,20 +117,19 @@ def evaluate(
     chosen = opt.background_of(run, background, *scenes)
     settings = RasterSettings(convention=convention)
     colour = chosen or BLACK
-    teaching = Teaching(
-        teacher,
-        colour,
-        chosen=chosen is not None,
-        photos=photos,
-        render_model=run.render_model,
-        seed=run.seed,
-        **run.callbacks,
-    )
     frozen = run.load(anchors) if anchors else None
-    found_views = teaching.views(given)
-    full = load_views(found_views, split, None, run.say, unpictured=teaching.dense is not None)
-    targets = scorable(teaching.targets(full.fitted(size), settings=settings), run.say)
-    unshrunk = teaching.full_size(full, size, settings=settings)
+    dense = None if teacher is None else load_scene(teacher, run.say, run.render_model)
+    teaching = Teaching.by(
+        dense, colour, chosen=chosen is not None, photos=photos, settings=settings, say=run.say
+    )
+    if dense is not None:
+        given = views_or_pool(dense, GivenViews(given, teacher, seed=run.seed), **run.callbacks)
+    assert given is not None  # `check_teacher`
+    full = load_views(given, split, None, run.say, unpictured=dense is not None)
+    fitted = full.fitted(size)
+    teaching.propose_background(fitted)
+    targets = scorable(teaching.targets(fitted, run.say), run.say)
+    unshrunk = teaching.full_size(shrunk(full, size))
     cameras = targets.cameras
     networks = load_lpips(lpips, scaled=lpips_input == "scaled") if lpips else None
     rows: list[dict[str, Any]] = []
@@ -182,7 +182,7 @@ def evaluate(
         results = zip(scenes, loaded, judged, strict=True)
         with run.showing("--output"):
             advice = _write_ladder(
-                run, output, list(results), unshrunk or targets, teaching, found_views, settings
+                run, output, list(results), unshrunk or targets, dense, teacher, teaching, given, settings
             )
     counts = Counter(view["against"] for view in rows[0]["views"])
     single = {"photo": "photos", "teacher": "teacher"}
@@ -197,6 +197,8 @@ def _write_ladder(
     output: Path,
     results: list[tuple[Path, Splats, Evaluation]],
     targets: Targets,
+    dense: Splats | None,
+    teacher: Path | None,
     teaching: Teaching,
     views: Views,
     settings: RasterSettings,
@@ -210,11 +212,9 @@ def _write_ladder(
     from g2ard.report.ladder import Dense, Rung, label_sizes, recommend_size, write_ladder
 
     run.begin("page")
-    dense = teaching.dense
     cameras = targets.cameras
     top = None
-    if dense is not None and teaching.teacher is not None:
-        teacher = Path(str(teaching.teacher))
+    if dense is not None and teacher is not None:
         top = Dense(teacher.name, len(dense), bytes_of(teacher))
     names = name_scenes([path for path, _, _ in results])
     words = label_sizes(names, [len(splats) for _, splats, _ in results], None if top is None else top.count)

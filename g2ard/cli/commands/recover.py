@@ -9,7 +9,7 @@ from g2ard.cli import options as opt
 from g2ard.cli.command import command
 from g2ard.cli.resume import check_scene_run, place_checkpoint, stoppable
 from g2ard.cli.run import Run
-from g2ard.cli.run_result import describe_loss, tell_plan
+from g2ard.cli.run_result import tell_plan
 from g2ard.config.schema import listed
 from g2ard.io.scene_formats import check_positions
 from g2ard.progress import plural
@@ -52,7 +52,7 @@ def recover(
     from g2ard.jobs.recover import prepare
     from g2ard.jobs.teaching import check_teacher
     from g2ard.rendering.targets import kinds_of
-    from g2ard.report.run import COLUMNS, list_cells
+    from g2ard.report.run import COLUMNS, describe_loss, list_cells
     from g2ard.stages.recover.config import RecoverConfig
     from g2ard.stages.recover.report import describe_idle_regularizers, describe_outcome, describe_time_limit
 
@@ -104,7 +104,7 @@ def recover(
             run.say(line)
     gain = result.report.psnr
     count = plural(len(job.student), "Gaussian")
-    where = f"{opt.trained_on(split)} {job.views.cameras.size_text}"
+    where = f"{opt.trained_on(split)} {job.targets.train.cameras.size_text}"
     run.say(f"{output}: {count}, {where}: {gain.before:.2f} → {gain.after:.2f} dB")
     report = {**result.report.as_dict(), "preset": job.preset, "prior": job.measures}
     report |= {"kinds": kinds, "settings": listed(job.config)}

@@ -26,7 +26,7 @@ from g2ard.system.peak_memory import peak_rss_of_all
 
 if TYPE_CHECKING:
     from g2ard.jobs.simplify import Reduction
-    from g2ard.stages.simplify import Simplified
+    from g2ard.pipeline.dense import Merged
 
 
 @command(
@@ -71,7 +71,7 @@ def simplify(
 
     from g2ard.jobs.inputs import GivenViews
     from g2ard.jobs.memory import WHOLE_TIMES, check_whole_memory
-    from g2ard.jobs.simplify import reducing
+    from g2ard.jobs.simplify import parents_of, reducing
     from g2ard.jobs.tile_options import is_tiled
     from g2ard.stages.simplify import SimplifyConfig
 
@@ -143,8 +143,7 @@ def simplify(
                     atomic_output(parents, overwrite=run.overwrite) as temporary,
                     temporary.open("wb") as file,
                 ):
-                    rows_of = small.parents if how is None else small.parents(source.scene)
-                    np.save(file, rows_of)  # (N,) int64 in the scene's row order
+                    np.save(file, parents_of(small, source))
             written = time.perf_counter()
             seconds = {"read": reading, "simplify": simplified - started, "write": written - simplified}
             seconds["total"], started = sum(seconds.values()), written
@@ -185,7 +184,7 @@ def _tell_plan(run: Run, reduce: Reduction, counts: Sequence[int]) -> None:
 
 
 def _tell_result(
-    run: Run, source: Source, reduce: Reduction, small: Simplified, output: Path, seconds: float
+    run: Run, source: Source, reduce: Reduction, small: Merged, output: Path, seconds: float
 ) -> None:
     from g2ard.stages.simplify.gaps import say_gaps
 
@@ -199,7 +198,7 @@ def _tell_result(
     run.say(f"{output}: {len(small.splats):,} of {count_content(reduce.total, source)} in {seconds:.1f} s")
 
 
-def _print_rounds(run: Run, small: Simplified) -> None:
+def _print_rounds(run: Run, small: Merged) -> None:
     columns = ["round", "before", "dropped", "merged", "refused", "trimmed", "after"]
     rows = []
     for number, r in enumerate(small.report.rounds, start=1):

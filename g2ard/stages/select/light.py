@@ -9,7 +9,7 @@ import g2ard._core as _core
 from g2ard.progress import Progress, silent
 from g2ard.rendering.renderer import arrays_of, centred, settings_for, view_of
 from g2ard.scene.cameras import Cameras
-from g2ard.scene.samples import evenly_spaced
+from g2ard.scene.samples import evenly_spaced, take_evenly
 from g2ard.scene.splats import Splats
 
 _RESOLVING_PIXELS = 16.0
@@ -60,7 +60,7 @@ def complete(
     ([1], 0.0)
     """
     some = np.array(evenly_spaced(len(scene), _SAMPLED_ROWS), np.int64)
-    measured = given.take(evenly_spaced(len(given), _SAMPLED_VIEWS))
+    measured = take_evenly(given, _SAMPLED_VIEWS)
     renders = len(measured) + len(offered)
 
     def light(cameras: Cameras, first: int) -> NDArray[np.float32]:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from g2ard.progress import Say
 from g2ard.rendering.renderer import Renderer, settings_for
 from g2ard.scene.cameras import Camera, Cameras
-from g2ard.scene.samples import evenly_spaced
+from g2ard.scene.samples import take_evenly
 from g2ard.scene.splats import Splats
 from g2ard.system.threads import in_threads
 
@@ -32,7 +32,7 @@ RECOVERED_GAPS = "keep more Gaussians, or recover longer (--schedule best)"
 
 def some_views(cameras: Cameras) -> Cameras:
     """Return the views in which gaps are measured."""
-    return cameras.take(evenly_spaced(len(cameras), _VIEWS)).resized(_PIXELS)
+    return take_evenly(cameras, _VIEWS).resized(_PIXELS)
 
 
 def light_lost(dense: Splats, result: Splats, views: Iterable[Camera]) -> tuple[float, float]:
