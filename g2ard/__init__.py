@@ -226,9 +226,9 @@ def __getattr__(name: str) -> Any:
 
 
 def _html_of(shown: Any) -> str:
-    from g2ard.jobs.notebook import html_of
+    from g2ard.jobs.notebook import write_html
 
-    return html_of(shown)
+    return write_html(shown)
 
 
 Shown._html_of = _html_of

@@ -20,7 +20,7 @@ from g2ard.config.choices import Engine
 from g2ard.errors import InputError
 from g2ard.pipeline.config import DistillConfig
 from g2ard.pipeline.distill import distill
-from g2ard.pipeline.presets import PRESETS, configured
+from g2ard.pipeline.presets import PRESETS, configure
 from g2ard.rendering.targets import Targets
 from g2ard.rendering.visibility import visibility_source
 from g2ard.scene.shape import effective_rank, needle_share
@@ -168,7 +168,7 @@ class _Workspace(Workspace):
             "recover.background": self.scene.background,
             "recover.seed": seed,
         }
-        config = configured(DistillConfig(), preset, values)
+        config = configure(DistillConfig(), preset, values)
         if config.recover.steps is not None:
             return config
         schedule = config.recover.schedule

@@ -143,13 +143,13 @@ class Claims:
         """Splits, points and exposures that are found beside views and photos."""
         from g2ard.io.exposures import exposure_file
         from g2ard.io.splits import split_files
-        from g2ard.jobs.start_points import sparse_file
+        from g2ard.jobs.start_points import find_sparse_file
 
         found: set[Path] = {exposure_file(photo) for photo in self._photos}
         for path in filter(may_hold_views, [*self._inputs, *self._cameras]):
             found.update(split_files(path))
             with suppress(G2ardError, OSError):  # the command will say it
-                found.update(filter(None, [sparse_file(path)]))
+                found.update(filter(None, [find_sparse_file(path)]))
         return found
 
 

@@ -18,7 +18,7 @@ from g2ard.config.choices import (
     PaperPresetName,
     PresetName,
     ViewFormat,
-    is_made,
+    is_given,
 )
 from g2ard.errors import require_torch
 from g2ard.io.detect import suffixes
@@ -76,7 +76,7 @@ AlphaOption = Annotated[
 
 def with_images(views: Path | None, folder: Path | None, alpha: Alpha = "composite") -> Any:
     """Return --views together with the options for its photos."""
-    given = views is not None and not is_made(views)
+    given = is_given(views)
     if folder is not None and not given:
         raise typer.BadParameter("--images goes with --views VIEWS")
     if not given or (folder is None and alpha == "composite"):

@@ -24,7 +24,7 @@ from g2ard.io.atomic import atomic_output
 from g2ard.io.reports import plain
 from g2ard.io.scene_formats import axes_note, scene_format
 from g2ard.io.scenes import tell, write_scene
-from g2ard.pipeline.presets import configured
+from g2ard.pipeline.presets import configure
 from g2ard.progress import Detail
 from g2ard.system import devices
 
@@ -96,7 +96,7 @@ class Run(Claims):
                 flag = "--recovery-time" if "time" in other else f"--set {other}"
                 raise typer.BadParameter(f"--steps and {flag} exclude each other; give one")
         try:
-            return values, configured(config, preset or "auto", values)
+            return values, configure(config, preset or "auto", values)
         except InputError as e:
             name = e.parameter or ""
             if not name or any(f".{path}".endswith(f".{name}") for path in typed):
@@ -245,10 +245,10 @@ class Run(Claims):
         if about_axes := axes_note(path, options):
             self.say(f"note: {path}: {about_axes}")
         if compare:
-            from g2ard.jobs.format_loss import loss_warning
+            from g2ard.jobs.format_loss import describe_format_loss
 
             with self.finishing("comparing the file with the scene"):
-                warning = loss_warning(path, splats, options)
+                warning = describe_format_loss(path, splats, options)
             if warning:
                 self.say(warning)
 

@@ -33,7 +33,7 @@ from g2ard.io.scene_formats import SUFFIXES
 from g2ard.io.types import ViewSet
 from g2ard.jobs.budget import DEVICES, Budget
 from g2ard.jobs.cost import LARGEST_DENSE
-from g2ard.jobs.viewer_frame import backdrop, frame_with
+from g2ard.jobs.viewer_frame import choose_backdrop, place_frame
 from g2ard.pipeline.distill import RunViews
 from g2ard.rendering.targets import fill
 from g2ard.report.labels import DENSE, RESULT, label_scenes, name_scenes
@@ -276,7 +276,7 @@ class RunFolder:
         most = DEVICES["web"]
         if count > most:
             return None, f"{self._view} skipped: over {most:,} Gaussians (`g2ard view` writes it anyway)"
-        stand = frame_with(splats, cameras)
+        stand = place_frame(splats, cameras)
         behind = self._choose_backdrop(background, splats if dense is None else dense[1], of_points)
         shown: list[Source | str] = [name_scenes([self.path])[0]]
         scenes = [splats]
@@ -292,8 +292,8 @@ class RunFolder:
 
     @staticmethod
     def _choose_backdrop(background: Colour, scene: Splats, of_points: bool = False) -> Colour | None:
-        """Return what is behind a scene in pictures and on pages, see `backdrop`."""
-        return backdrop(None if background == BLACK else background, [scene], of_points=of_points)
+        """Return what is behind a scene in pictures and on pages, see `choose_backdrop`."""
+        return choose_backdrop(None if background == BLACK else background, [scene], of_points=of_points)
 
     def say_files(self, page: str = "") -> None:
         """Name the files, and record that the run is finished."""

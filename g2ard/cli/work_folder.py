@@ -4,22 +4,23 @@ from __future__ import annotations
 
 import re
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import typer
 
 from g2ard.cli.budget_options import TILES
 from g2ard.cli.run import Run
-from g2ard.config.choices import is_made
+from g2ard.config.choices import is_given
 from g2ard.errors import G2ardError, OutputError
 from g2ard.io.atomic import drop_empty, hidden_name, parents_made
 from g2ard.io.lock import check_unlocked, locked
 
 if TYPE_CHECKING:
     from g2ard.io import Source
+    from g2ard.jobs.inputs import Views
     from g2ard.jobs.tile_options import Tiling
 
 
@@ -29,7 +30,7 @@ _WORK_NAME = re.compile(r"tiles|steps|(cleaned|merged|level|written)-[0-9a-f]{16
 
 def read_tiling(run: Run, source: Source | None, output: Path) -> Tiling:
     """Check the options and return them as a `Tiling`."""
-    from g2ard.jobs.memory import bytes_of
+    from g2ard.jobs.memory import parse_bytes
     from g2ard.jobs.tile_options import Tiling
 
     tile_rows, memory, workers, scheduler, work = (run.shared.get(name) for name in TILES)
@@ -37,7 +38,7 @@ def read_tiling(run: Run, source: Source | None, output: Path) -> Tiling:
     if rows is not None and source is not None:
         _check_rows(source, rows)
     with run.usage():
-        size = None if memory is None else bytes_of(memory)
+        size = None if memory is None else parse_bytes(memory)
     if scheduler is not None and scheduler != "local" and "://" not in scheduler:
         raise typer.BadParameter(f"--scheduler: expected tcp://HOST:PORT or local, got {scheduler!r}")
     folder = work or _place_beside(output)
@@ -72,7 +73,7 @@ def _check_rows(source: Source, rows: int) -> None:
 
 
 @contextmanager
-def work_folder(run: Run, tiling: Tiling | None, *views: Any, again: str = "") -> Iterator[None]:
+def work_folder(run: Run, tiling: Tiling | None, *views: Views | None, again: str = "") -> Iterator[None]:
     """Hold `tiling.folder`, created if absent, while a command works on tiles there; do nothing for None.
 
     Finished tasks in it are not computed again, with or without --resume and --overwrite: their names hash
@@ -140,12 +141,12 @@ def _check_folder(folder: Path) -> None:
         )
 
 
-def _check_given(tiling: Tiling, views: tuple[Any, ...]) -> None:
+def _check_given(tiling: Tiling, views: Sequence[Views | None]) -> None:
     from g2ard.jobs.inputs import load_view_sets
     from g2ard.tiles.executor import executor
 
     for given in views:
-        if given is not None and not is_made(given):
+        if given is not None and is_given(given):
             load_view_sets(given, [], None, unpictured=True)
     if tiling.scheduler not in (None, "local"):
         with executor(scheduler=tiling.scheduler):

@@ -95,6 +95,11 @@ def is_made(views: object) -> bool:
     return isinstance(views, str) and views == "made"
 
 
+def is_given(views: object) -> bool:
+    """Return whether views are neither found nor generated."""
+    return views is not None and not is_made(views)
+
+
 def colour_text(colour: Colour) -> str:
     """Return a colour as `--background` takes it.
 

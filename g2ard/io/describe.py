@@ -93,7 +93,7 @@ def _splats(splats: Splats) -> Json:
         "render_model": splats.render_model,
         "bytes_as_ply": splats.nbytes,
         "offset": splats.offset.tolist(),
-        "extent": _extent(splats.means.astype(float) + splats.offset),
+        "extent": _extent(splats.positions),
         "opacity": _quantiles(opacities),
         "largest_scale": _quantiles(scales[:, 2]),
         "smallest_scale": _quantiles(scales[:, 0]),

@@ -60,7 +60,7 @@ class Stream(RawStream):
 def form_of(path: Path, splats: Splats) -> Splats:
     """Return a scene as a .splat holds it: y down, and relative to an offset if it is far from the origin."""
     form = as_packed(path, splats)
-    world = form.means.astype(float) + form.offset
+    world = form.positions
     step = np.spacing(np.abs(world).max().astype(np.float32))
     far = np.abs(np.median(world, axis=0)).max() > FAR_FROM_ORIGIN
     if far or step > np.median(form.scales.min(axis=1)):
@@ -80,9 +80,9 @@ def write(path: Path, splats: Splats, *, overwrite: bool = False) -> float:
     It cannot state an `offset` or axes: see `form_of`. Return the largest change of a position by rounding.
     """
     form = form_of(path, splats)
-    exact = splats.means.astype(float) + splats.offset
+    exact = splats.positions
     again = restored(form, form.axes)
-    error = float(np.abs(again.means.astype(float) + again.offset - exact).max())
+    error = float(np.abs(again.positions - exact).max())
     splats = form
     weight = splats.scales.astype(float).prod(1) * splats.opacities
     splats = splats.take(np.argsort(-weight, kind="stable"))

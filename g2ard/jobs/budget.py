@@ -33,10 +33,10 @@ _UNITS = {"k": 1e3, "m": 1e6, "g": 1e9}
 _COUNT = re.compile(r"(\d+(?:\.\d+)?)\s*([kKmM]?)")
 
 
-def count_of(given: int | str | None) -> int | None:
+def parse_count(given: int | str | None) -> int | None:
     """Return a count that is given as a number, or as text such as 50k, 1.5M or 50_000.
 
-    >>> count_of("50k"), count_of("1.5M"), count_of(" 50_000 "), count_of(7)
+    >>> parse_count("50k"), parse_count("1.5M"), parse_count(" 50_000 "), parse_count(7)
     (50000, 1500000, 50000, 7)
     """
     if not isinstance(given, str):

@@ -18,7 +18,7 @@ from g2ard.io import write_splats
 from g2ard.io.scene_formats import scene_format, written_bytes
 from g2ard.io.scenes import read_back
 from g2ard.io.stream import PartsStream
-from g2ard.pipeline.dense import whole
+from g2ard.pipeline.dense import load_whole
 from g2ard.progress import Say, plural, unsaid
 from g2ard.rendering.metrics import psnr, ssim
 from g2ard.rendering.renderer import Renderer
@@ -74,22 +74,22 @@ class Quality:
         return min(self.psnr - wanted.psnr if wanted.psnr > 0 else math.inf, of_ssim)
 
 
-def file_bytes(splats: Splats, name: str, **options: Any) -> int:
+def measure_file(splats: Splats, name: str, **options: Any) -> int:
     """Return the bytes of the scene as `write_splats` writes it under `name`."""
-    with _written(splats, name, **options) as path:
+    with _write_temporarily(splats, name, **options) as path:
         return written_bytes(path)
 
 
-def as_file(splats: Splats, name: str) -> Splats:
+def pass_through_file(splats: Splats, name: str) -> Splats:
     """Return the scene as read back from the format of `name`: quantised and without unsupported fields."""
     if not scene_format(name).loss:
         return splats
-    with _written(splats, name) as path:
+    with _write_temporarily(splats, name) as path:
         return read_back(path, splats)
 
 
 @contextmanager
-def _written(splats: Splats, name: str, **options: Any) -> Iterator[Path]:
+def _write_temporarily(splats: Splats, name: str, **options: Any) -> Iterator[Path]:
     """Yield a temporary file of the scene in the format of `name`."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "scene" / "meta.json"
@@ -99,7 +99,7 @@ def _written(splats: Splats, name: str, **options: Any) -> Iterator[Path]:
         yield path
 
 
-def count_for_bytes(
+def find_count_for_bytes(
     splats: Splats,
     wanted: int,
     name: str,
@@ -119,16 +119,17 @@ def count_for_bytes(
     most = total or len(splats)
     fewest = min(_FEWEST_GAUSSIANS, most)
     if total is not None and scene_format(name).suffix == ".ply":
-        return _count_of_ply(splats, wanted, name, most)
+        return _find_count_of_ply(splats, wanted, name, most)
     sample = take_evenly(splats, _PROBE_ROWS, floor=True)
-    count = int(len(sample) * wanted / file_bytes(sample, name))
+    count = int(len(sample) * wanted / measure_file(sample, name))
     if reduce is None:
         return min(max(count, fewest), most)
-    fits, over = (0, 0), (most + 1, 0)  # (count, bytes); 0 bytes means no such file yet
+    fits = (0, 0)
+    over = (most + 1, 0)  # (count, bytes); 0 bytes means no such file yet
     files: list[tuple[int, int]] = []
     while len(files) < _BYTES_PROBES or not fits[0]:
         count = min(max(count, fits[0] + 1, fewest), over[0] - 1, most)
-        size = file_bytes(reduce(count) if count < most else splats, name)
+        size = measure_file(reduce(count) if count < most else splats, name)
         size = size * most // len(splats) if count == most else size  # of a sample
         files.append((count, size))
         if size <= wanted:
@@ -148,14 +149,14 @@ def count_for_bytes(
             count = round(fits[0] + min(max(share, 0.1), 0.9) * (over[0] - fits[0]))
         else:
             near = count * _BYTES_GOAL * wanted / size
-            if len(files) > 1 and (slope := _slope(*files[-2:])) > 0:  # a file has a head too
+            if len(files) > 1 and (slope := _measure_slope(*files[-2:])) > 0:  # a file has a head too
                 near = count + (_BYTES_GOAL * wanted - size) / slope
             count = int(min(max(near, count / 4), 4 * count))
     return fits[0]
 
 
-def _count_of_ply(splats: Splats, wanted: int, name: str, most: int) -> int:
-    one, two = (file_bytes(splats.take(np.arange(rows)), name) for rows in (1, 2))
+def _find_count_of_ply(splats: Splats, wanted: int, name: str, most: int) -> int:
+    one, two = (measure_file(splats.take(np.arange(rows)), name) for rows in (1, 2))
     header = one - (two - one) + len(str(most))
     count = min(most, (wanted - header) // (two - one))
     if count < 1:
@@ -163,11 +164,11 @@ def _count_of_ply(splats: Splats, wanted: int, name: str, most: int) -> int:
     return count
 
 
-def _slope(before: tuple[int, int], after: tuple[int, int]) -> float:
+def _measure_slope(before: tuple[int, int], after: tuple[int, int]) -> float:
     return (after[1] - before[1]) / (after[0] - before[0])
 
 
-def count_for_layers(count: int, most: float, reduce: Callable[[int], Splats]) -> tuple[int, float]:
+def find_count_for_layers(count: int, most: float, reduce: Callable[[int], Splats]) -> tuple[int, float]:
     """Return a count up to `count` whose near views blend at most `most` Gaussians per pixel, and their mean.
 
     Overdraw falls about with the square root of the count, which predicts the next one. The mean exceeds
@@ -184,21 +185,21 @@ def count_for_layers(count: int, most: float, reduce: Callable[[int], Splats]) -
     return count, layers
 
 
-def clipped_images(splats: Splats, cameras: Cameras) -> list[NDArray[Any]]:
+def render_clipped(splats: Splats, cameras: Cameras) -> list[NDArray[Any]]:
     renderer = Renderer(splats)
     return [renderer.clipped(camera) for camera in cameras]
 
 
-def quality(renders: list[Any], splats: Splats, cameras: Cameras) -> Quality:
+def measure_quality(renders: list[Any], splats: Splats, cameras: Cameras) -> Quality:
     """Return the quality of a scene against images in [0, 1], one per camera."""
-    pairs = list(zip(clipped_images(splats, cameras), renders, strict=True))
+    pairs = list(zip(render_clipped(splats, cameras), renders, strict=True))
     return Quality(
         float(np.mean([psnr(image, target) for image, target in pairs])),
         float(np.mean([ssim(image, target) for image, target in pairs])),
     )
 
 
-def count_for_quality(
+def find_count_for_quality(
     renders: list[NDArray[Any]],
     total: int,
     wanted: Quality,
@@ -218,23 +219,26 @@ def count_for_quality(
         total: number of its Gaussians.
         reduce: count → scene, by the method that makes the result.
     """
-    met, good, missed = total, Quality(float("inf"), 1.0), 0
+    met = total
+    good = Quality(float("inf"), 1.0)
+    missed = 0
     excesses: dict[int, float] = {}
     count = max(_FEWEST_GAUSSIANS, total // 4)
     while len(excesses) < _QUALITY_TRIALS and missed < count < met:
-        measured = quality(renders, reduce(count), cameras)
+        measured = measure_quality(renders, reduce(count), cameras)
         excesses[count] = excess = measured.over(wanted)
         if excess >= 0:
-            met, good = count, measured
+            met = count
+            good = measured
         else:
             missed = count
         if 0 <= excess <= _QUALITY_TOLERANCE or met <= _FEWEST_GAUSSIANS:
             break
-        count = _next_count(excesses, met, missed, total)
+        count = _predict_count(excesses, met, missed, total)
     return met, good
 
 
-def _next_count(excesses: Mapping[int, float], met: int, missed: int, most: int) -> int:
+def _predict_count(excesses: Mapping[int, float], met: int, missed: int, most: int) -> int:
     """Predict the count whose excess is half the tolerance.
 
     Args:
@@ -247,7 +251,8 @@ def _next_count(excesses: Mapping[int, float], met: int, missed: int, most: int)
         share = (goal - excesses[missed]) / max(excesses[met] - excesses[missed], 1e-12)
         return round(missed * (met / missed) ** min(max(share, 0.05), 0.95))
     near = met if met < most else missed
-    (a, at_a), (b, at_b) = min(excesses.items()), max(excesses.items())
+    a, at_a = min(excesses.items())
+    b, at_b = max(excesses.items())
     slope = (at_b - at_a) / math.log2(b / a) if b > a else _GAIN_PER_DOUBLING
     steps = (goal - excesses[near]) / max(slope, _GAIN_PER_DOUBLING / 4)
     # Extrapolation is unreliable, and towards N the excess grows faster than linearly.
@@ -276,7 +281,7 @@ class ResolvedBudget:
 
     def shrink(self, splats: Splats, say: Say = unsaid) -> Splats:
         """Merge the scene further while its file is too large."""
-        while self.bytes is not None and (size := file_bytes(splats, self.file)) > self.bytes:
+        while self.bytes is not None and (size := measure_file(splats, self.file)) > self.bytes:
             fewer = max(1, int(len(splats) * self.bytes / size * 0.99))
             if fewer == len(splats):
                 break
@@ -290,8 +295,9 @@ class ResolvedBudget:
             return None
 
         assert self.cameras is not None
-        got = quality(self.renders, as_file(whole(splats), self.file), self.cameras)
-        count, views = plural(len(splats), "Gaussian"), plural(len(self.cameras), "view")
+        got = measure_quality(self.renders, pass_through_file(load_whole(splats), self.file), self.cameras)
+        count = plural(len(splats), "Gaussian")
+        views = plural(len(self.cameras), "view")
         line = f"{count} keep {got} in the {views} that chose the count"
         if got.meets(self.wanted):
             return True, f"{line}; requested: {self.wanted}"

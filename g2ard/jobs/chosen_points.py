@@ -135,7 +135,9 @@ class ChosenPoints(PointStream):
 
     def __init__(self, stream: PointStream, choice: PointChoice, progress: Progress) -> None:
         vars(self).update(vars(stream))  # the same cloud, of which `raw` yields less
-        self.tally, self._whole, self._choice = Tally("point"), stream, choice
+        self.tally = Tally("point")
+        self._whole = stream
+        self._choice = choice
         self.ranges: _Ranges = {}
         self._fields = {name.lower(): name for name in reversed(stream.fields) if name.isidentifier()}
         self._shade = self._column_of_color()
@@ -144,8 +146,10 @@ class ChosenPoints(PointStream):
         self._also = sorted(wanted | ({self._shade} if self._shade else set()))
         stream.also = tuple(self._fields[name] for name in self._also)
         blocks = -(-stream.count // _ROWS)
-        places, shades = [np.zeros((0, 3))], [np.zeros((0, 1), np.float32)]
-        read, self._counts = 0, list[int]()
+        places = [np.zeros((0, 3))]
+        shades = [np.zeros((0, 1), np.float32)]
+        read = 0
+        self._counts = list[int]()
         for positions, values, noise in self._chosen():
             read = min(stream.count, read + _ROWS)
             progress("points", read, stream.count)
@@ -160,7 +164,8 @@ class ChosenPoints(PointStream):
             if len(found) and not np.ptp(found):
                 text = f"colours nothing: it is {found[0, 0]:g} at all points"
                 raise InputError(text, path=stream.path, property=self._shade)
-            self.channels, self._range = 1, choose_shades(found)
+            self.channels = 1
+            self._range = choose_shades(found)
 
     def identity(self) -> list[Any]:
         return [*self._whole.identity(), list(astuple(self._choice))]
@@ -210,7 +215,9 @@ class ChosenPoints(PointStream):
             values: (n, k) colours, then the further columns.
         """
         keep = np.ones(len(positions), bool)
-        box, where, own = self._choice.box, self._choice.where, values.shape[1] - len(self._also)
+        box = self._choice.box
+        where = self._choice.where
+        own = values.shape[1] - len(self._also)
         if box is not None:
             keep &= within_box(positions, box[:3], box[3:])
             for name in _PLACE:

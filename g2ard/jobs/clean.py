@@ -14,7 +14,7 @@ from g2ard.config.checks import checks_arguments
 from g2ard.config.choices import RenderModel
 from g2ard.errors import InputError, require
 from g2ard.jobs.inputs import load_scene
-from g2ard.jobs.run_views import pool_times
+from g2ard.jobs.run_views import find_pool_growth
 from g2ard.pipeline.dense import Dense, InMemory
 from g2ard.poses import plan_pool
 from g2ard.progress import Progress, Say, plural, silent, unsaid
@@ -106,7 +106,7 @@ def clean(
     >>> len(done.splats), done.clutter.counts["invisible"]
     (860, 40)
     """
-    kinds = kinds_of(only, strength)
+    kinds = choose_kinds(only, strength)
     splats = load_scene(scene, say, render_model)
     if kinds:
         check_finite(splats, "scene")
@@ -119,43 +119,45 @@ def clean(
         )
     if not kinds:
         return Cleaned(splats, Cleaning(np.full(len(splats), -1, np.int8)), sky, None)
-    cameras = _views(splats, seed, progress)
+    cameras = _plan_views(splats, seed, progress)
     seen = visibility(splats, cameras, progress)
-    pixels = int((cameras.widths.astype(int) * cameras.heights).sum())
+    pixels = int(cameras.pixels.sum())
     unoccluded, floating = compare_depths(
         splats, cameras, floating=bool(set(kinds) & set(FLOATING)), progress=progress
     )
     clutter = find_clutter(
         splats, seen, unoccluded, pixels, kinds, floating=floating, strength=strength, progress=progress
     )
-    _tell(clutter, seen.weight[~clutter.keep].sum() / max(seen.weight.sum(), 1e-30), kinds, say)
+    _tell_clutter(clutter, seen.weight[~clutter.keep].sum() / max(seen.weight.sum(), 1e-30), kinds, say)
     return Cleaned(splats, clutter, sky, cameras)
 
 
-def _views(splats: Splats, seed: int, progress: Progress, represents: float = 1.0) -> Cameras:
+def _plan_views(splats: Splats, seed: int, progress: Progress, represents: float = 1.0) -> Cameras:
     """Return generated views that show clutter; `represents` is that of `plan_pool`."""
-    count = round(CLUTTER_VIEWS * pool_times(represents * len(splats))) if represents > 1 else CLUTTER_VIEWS
+    count = (
+        round(CLUTTER_VIEWS * find_pool_growth(represents * len(splats))) if represents > 1 else CLUTTER_VIEWS
+    )
     how: dict[str, Any] = {"rows": _CLUTTER_ROWS, "near": _CLUTTER_NEAR, "represents": represents}
     return plan_pool(splats, count, seed=seed, progress=progress, **how).cameras.resized(CLUTTER_SIDE)
 
 
-def _tell(clutter: Cleaning, light: float, kinds: Sequence[str], say: Say) -> None:
+def _tell_clutter(clutter: Cleaning, light: float, kinds: Sequence[str], say: Say) -> None:
     parts = [f"{count:,} {name}" for name, count in clutter.counts.items() if name in kinds]
     gone = len(clutter.kind) - int(clutter.keep.sum())
     whole = plural(len(clutter.kind), "Gaussian")
     say(f"{gone:,} of {whole} are clutter, with {light:.1%} of the light: {', '.join(parts)}")
 
 
-def without_clutter(
+def remove_clutter(
     dense: Dense, *, seed: int = 0, progress: Progress = silent, say: Say = unsaid
 ) -> tuple[Dense, dict[str, int]]:
     """Return a dense scene without its clutter, and the number of Gaussians removed by kind."""
     from g2ard.tiles.dense import InTiles
 
     if isinstance(dense, InTiles):
-        cameras = _views(dense.sample, seed, progress, dense.total / len(dense.sample))
+        cameras = _plan_views(dense.sample, seed, progress, dense.total / len(dense.sample))
         rest, clutter, light = dense.without_clutter(cameras)
-        _tell(clutter, light, kinds_of(None, 0), say)
+        _tell_clutter(clutter, light, choose_kinds(None, 0), say)
         return rest, clutter.counts
     if dense.total > len(dense.sample):  # in tiles that are only planned
         return dense, {}
@@ -163,7 +165,7 @@ def without_clutter(
     return InMemory(done.splats), done.clutter.counts
 
 
-def kinds_of(only: Sequence[str] | None, strength: float) -> tuple[str, ...]:
+def choose_kinds(only: Sequence[str] | None, strength: float) -> tuple[str, ...]:
     """Return the kinds of clutter to remove, after checking that they are known and have a strength."""
     require("strength", strength, 0 <= strength <= 1, "a number from 0 to 1")
     for kind in only or ():
@@ -173,11 +175,11 @@ def kinds_of(only: Sequence[str] | None, strength: float) -> tuple[str, ...]:
     return tuple(kind for kind in (KINDS if only is None else only) if strength or kind not in FLOATING)
 
 
-def painted(splats: Splats, colors: ArrayLike) -> Splats:
+def paint(splats: Splats, colors: ArrayLike) -> Splats:
     """Recolour a scene by (N, 3) colours in [0, 1], at SH degree 0, shaded by the luma of its own colours.
 
     >>> scene = Splats.create(np.zeros((2, 3)), scales=np.ones((2, 3)), sh0=np.full((2, 1, 3), 9.0))
-    >>> painted(scene, [[1, 0, 0], [0, 0, 1]]).colors.round(3).tolist() == [[1, 0, 0], [0, 0, 1]]
+    >>> paint(scene, [[1, 0, 0], [0, 0, 1]]).colors.round(3).tolist() == [[1, 0, 0], [0, 0, 1]]
     True
     """
     paint = np.asarray(colors, np.float64)

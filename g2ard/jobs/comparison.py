@@ -49,7 +49,8 @@ class Common:
     def of(cls, path: Path) -> Common:
         """Read the source of a run's own scores."""
         report = read_json(path / "report.json")
-        against, config = report.get("against", RENDERS), report["config"]
+        against = report.get("against", RENDERS)
+        config = report["config"]
         teacher = None if against == "photos" else Path(config["scene"])
         return cls(path, path, teacher, teacher is not None and "photo" in against, config["size"])
 
@@ -84,34 +85,34 @@ def is_run(path: Path) -> bool:
     return run_scene(path) != path and run_views(path) != path
 
 
-def source_of(path: Path) -> Path | None:
+def find_source(path: Path) -> Path | None:
     """Return the real path of the dense scene of a run, or None."""
     config = read_json(path / "report.json").get("config", {}) if is_run(path) else {}
     scene = config.get("scene")
     return None if scene is None else real_path(Path(scene))
 
 
-def made_of_points(path: Path, opened: Source | None = None) -> bool:
+def is_made_of_points(path: Path, opened: Source | None = None) -> bool:
     """Return whether a scene is a point cloud, or was made of one: a run's result, or its scene file.
 
     Args:
         opened: the source of `path`, if there is one.
     """
-    dense = source_of(path if path.is_dir() else path.parent)
+    dense = find_source(path if path.is_dir() else path.parent)
     if dense is None:
         return path.exists() and (opened or Source(path)).kind == "points"
     return dense.exists() and Source(dense).kind == "points"
 
 
-def dense_first(first: Path, second: Path) -> tuple[list[Path], tuple[str, ...]]:
+def put_dense_first(first: Path, second: Path) -> tuple[list[Path], tuple[str, ...]]:
     """Return two scenes, the dense one before a run's result, with their roles; others as given, without."""
     for dense, result in ((first, second), (second, first)):
-        if source_of(result) == real_path(dense):
+        if find_source(result) == real_path(dense):
             return [dense, result], (DENSE, RESULT)
     return [first, second], ()
 
 
-def common_of(paths: Sequence[Path], *, background: bool = False) -> Common | None:
+def find_common(paths: Sequence[Path], *, background: bool = False) -> Common | None:
     """Return the views and targets in which the results of all runs among `paths` can be scored.
 
     They are those of a single run. Several runs share the views that one of them held out and none trained
@@ -136,14 +137,14 @@ def common_of(paths: Sequence[Path], *, background: bool = False) -> Common | No
         )
     if not others:
         return first
-    views = _common_views(runs, first.teacher is not None and not first.photos)
+    views = _find_common_views(runs, first.teacher is not None and not first.photos)
     return replace(first, views=ViewSet(views, splits=("test",) * len(views)), size=None)
 
 
 _Key = tuple[object, ...]
 
 
-def _key(view: Camera) -> _Key:
+def _identify_view(view: Camera) -> _Key:
     """Return what equal views of different runs have in common: the photo, otherwise pose and lens."""
     if view.image_path is not None:
         return (real_path(view.image_path),)
@@ -151,7 +152,7 @@ def _key(view: Camera) -> _Key:
     return (*(view.viewmat.round(_POSE_DIGITS) + 0.0).ravel().tolist(), *(lens + 0.0).ravel().tolist())
 
 
-def _common_views(runs: Sequence[Common], rendered: bool) -> Cameras:
+def _find_common_views(runs: Sequence[Common], rendered: bool) -> Cameras:
     """Return the views that a run held out and none trained on, at one size."""
     held_out: dict[_Key, Camera] = {}
     trained: set[_Key] = set()
@@ -159,7 +160,7 @@ def _common_views(runs: Sequence[Common], rendered: bool) -> Cameras:
     for run in runs:
         own: dict[_Key, Camera] = {}
         for view, split in run.each_view():
-            key = _key(view)
+            key = _identify_view(view)
             own[key] = view
             if split != "test":
                 trained.add(key)
@@ -178,7 +179,7 @@ def _common_views(runs: Sequence[Common], rendered: bool) -> Cameras:
         )
     sides = [max(view.width, view.height) for view in left.values()]
     ordered = [left[key] for key in sorted(left, key=lambda key: (left[key].name, tuple(map(str, key))))]
-    cameras = Cameras.of(_named(ordered))
+    cameras = Cameras.of(_number_names(ordered))
     return cameras.scaled(max(sides)) if rendered else cameras.resized(min(sides))
 
 
@@ -198,7 +199,7 @@ def _check_same_photos(first: Path, own: dict[_Key, Camera], second: Path, other
         raise InputError(f"has another pose of photo {moved[0]} than {first}", path=second)
 
 
-def _named(views: Sequence[Camera]) -> list[Camera]:
+def _number_names(views: Sequence[Camera]) -> list[Camera]:
     """Number views of the same name."""
     names = Counter(view.name for view in views)
     used: Counter[str] = Counter()
@@ -210,7 +211,7 @@ def _named(views: Sequence[Camera]) -> list[Camera]:
     return found
 
 
-def better_line(
+def describe_better(
     names: Sequence[str], scores: Sequence[Evaluation], targets: Targets, split: str
 ) -> str | None:
     """Say which of several scenes scores best, and by how much; None for a single one.
@@ -219,7 +220,7 @@ def better_line(
     >>> views = Cameras.of([Camera.facing([0, -3, 0], [0, 0, 0], width=64, height=48)])
     >>> photos = Photos(views, [np.zeros((48, 64, 3), np.uint8)])
     >>> from types import SimpleNamespace as Score
-    >>> better_line("AB", [Score(psnr=30.0, ssim=0.9), Score(psnr=33.3, ssim=0.8)], photos, "test")
+    >>> describe_better("AB", [Score(psnr=30.0, ssim=0.9), Score(psnr=33.3, ssim=0.8)], photos, "test")
     'B is better: +3.3 dB in 1 test photo, 64×48 px, though A has the better SSIM (0.9000, 0.8000)'
     """
     if len(scores) < 2:

@@ -18,7 +18,7 @@ from g2ard.errors import InputError, require
 from g2ard.io import Source
 from g2ard.io.scene_formats import FORMATS
 from g2ard.jobs.chosen_points import PointChoice
-from g2ard.jobs.inputs import lifted_cloud, load_scene
+from g2ard.jobs.inputs import lift_cloud, load_scene
 from g2ard.progress import Progress, Say, silent, unsaid
 from g2ard.scene.conditions import check_condition, fulfilling
 from g2ard.scene.splats import Splats
@@ -160,17 +160,18 @@ def convert(
     >>> convert([pair, pair], where="x > 1", scale=2).means.tolist()
     [[10.0, 0.0, 0.0], [10.0, 0.0, 0.0]]
     """
-    opened = opened_scenes(scenes, render_model)
+    opened = open_scenes(scenes, render_model)
     points = None if color is None else PointChoice(color=color)
     if isinstance(opened, Source):
-        points, where = PointChoice(None if invert else box, where, color), None
+        points = PointChoice(None if invert else box, where, color)
+        where = None
     changes = Changes(
         box, sphere, invert, where, transform, scale, rotate, translate, recentre, to_axes, sh_degree
     )
     return changes.apply(read_merged(opened, points, from_axes, say))
 
 
-def opened_scenes(
+def open_scenes(
     scenes: Scene | Sequence[Scene], render_model: RenderModel | None = None
 ) -> Source | list[Splats | Source]:
     """Return scenes that are not read yet; point clouds alone become one."""
@@ -189,7 +190,7 @@ def read_merged(
     say: Say = unsaid,
     progress: Progress = silent,
 ) -> Splats:
-    """Read the result of `opened_scenes` and join it; point clouds are lifted.
+    """Read the result of `open_scenes` and join it; point clouds are lifted.
 
     Args:
         points: of point clouds to read.
@@ -198,15 +199,15 @@ def read_merged(
     if not isinstance(opened, Source):
         if points is not None:
             raise InputError("is for point clouds alone", parameter=points.given[0])
-        return join([_loaded(source, from_axes, say) for source in opened])
+        return join([_load_in_axes(source, from_axes, say) for source in opened])
     if from_axes is not None:
         raise InputError("has no effect on point clouds", parameter="from_axes")
     if points is not None:
         points.narrow(opened, progress)
-    return lifted_cloud(opened, progress, say)
+    return lift_cloud(opened, progress, say)
 
 
-def _loaded(scene: Splats | Source, axes: AxesName | None, say: Say) -> Splats:
+def _load_in_axes(scene: Splats | Source, axes: AxesName | None, say: Say) -> Splats:
     """Read a scene whose file may store other axes than its format defines."""
     splats = load_scene(scene, say)
     if axes is None:

@@ -4,24 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import TYPE_CHECKING
 
 from g2ard.errors import InputError
 from g2ard.io.sog_write import palette_size
 from g2ard.io.tile_store import row_width
 from g2ard.jobs.clean import CLUTTER_SIDE, CLUTTER_VIEWS
-from g2ard.jobs.memory import RECOVERY_TIMES, TileMemory, amount
-from g2ard.jobs.run_views import within_pixels
-from g2ard.pipeline.distill import round_counts
+from g2ard.jobs.memory import RECOVERY_TIMES, TileMemory, format_bytes
+from g2ard.jobs.run_views import limit_pixels
+from g2ard.pipeline.distill import plan_round_counts
 from g2ard.progress import plural
 from g2ard.rendering.targets import CACHE_BYTES
 from g2ard.system.threads import threads_used
 
 if TYPE_CHECKING:
     from g2ard.io.stream import SceneStream
+    from g2ard.jobs.distill_job import DistillJob
     from g2ard.jobs.simplify import Reduction
     from g2ard.scene.cameras import Cameras
     from g2ard.scene.splats import Splats
@@ -76,11 +74,10 @@ class Cost:
     disk: int = 0
 
 
-def cost_of(job: Any, count: int, *, page: bool = True) -> Cost:
+def cost_of(job: DistillJob, count: int, *, page: bool = True) -> Cost:
     """Return the cost of distilling a prepared job's scene to `count` Gaussians.
 
     Args:
-        job: a `DistillJob`; its module uses this one.
         page: whether pages with the result are written.
     """
     train = job.views.train.cameras
@@ -97,41 +94,30 @@ def cost_of(job: Any, count: int, *, page: bool = True) -> Cost:
 
 
 def cost_of_recovery(
-    scene: Splats,
-    training: Cameras,
-    steps: int | None,
-    *,
-    scored: Cameras | None = None,
-    validation: Cameras | None = None,
-    teacher: Splats | None = None,
+    scene: Splats, views: Sequence[Cameras], steps: int | None, teacher: Splats | None = None
 ) -> Cost:
     """Return the cost of fitting a scene as it is, by `g2ard recover` or `g2ard adapt`.
 
     Args:
+        views: for training, and others that need a target.
         steps: of the fit; None if a time limits them.
-        scored: views scored before and after.
-        validation: further views that need a target.
         teacher: scene that renders the targets; None if they are photos.
     """
-    used = [part for part in (training, scored, validation) if part is not None]
     dense = 0 if teacher is None else int(_KEPT_TIMES * teacher.nbytes)
-    memory = _PROGRAM_BYTES + _target_bytes(used, teacher) + _image_bytes(used)
+    memory = _PROGRAM_BYTES + _target_bytes(views, teacher) + _image_bytes(views)
     memory += dense + int(_KEPT_TIMES * scene.nbytes) + TRAINER_BYTES * len(scene)
-    return Cost(sum(map(len, used)), _mean_pixels(training), steps, memory)
+    return Cost(sum(map(len, views)), _mean_pixels(views[0]), steps, memory)
 
 
 def _mean_pixels(cameras: Cameras) -> int:
-    return int(np.mean(_pixels(cameras)))
-
-
-def _pixels(cameras: Cameras) -> NDArray[np.int64]:
-    return cameras.widths.astype(np.int64) * cameras.heights
+    return int(cameras.pixels.mean())
 
 
 def cost_of_reduction(reduce: Reduction, count: int) -> Cost:
     """Return the cost of simplifying a scene to `count` Gaussians; its views measure visibility."""
     seen = reduce.seen if count < reduce.total else None
-    views, plan = 0 if seen is None else len(seen), reduce.plan
+    views = 0 if seen is None else len(seen)
+    plan = reduce.plan
     if plan is not None:
         return Cost(views, 0, 0, plan.bytes, plan.disk)
     memory = _PROGRAM_BYTES + int(_SCENE_TIMES * reduce.dense.sample.nbytes)
@@ -148,17 +134,21 @@ def cost_of_cleaning(scene: SceneStream, kinds: Sequence[str]) -> Cost:
     return Cost(CLUTTER_VIEWS, CLUTTER_SIDE**2 * 3 // 4, 0, memory)
 
 
-def _peak_bytes(job: Any, count: int, page: bool, *, trains: bool) -> int:
+def _peak_bytes(job: DistillJob, count: int, page: bool, *, trains: bool) -> int:
     """Return the peak memory: of simplification, of recovery, or of what is written at the end."""
-    given, views, train = job.config.recover.sh_degree, job.views, job.views.train.cameras
-    count = round_counts(job.dense, count, job.config)[0]
+    given = job.config.recover.sh_degree
+    views = job.views
+    train = job.views.train.cameras
+    count = plan_round_counts(job.dense, count, job.config)[0]
     degree = job.prior.sh_degree if given is None else given
-    dense, scene, small = len(job.prior), job.prior.nbytes, 4 * row_width(degree) * count
+    dense = len(job.prior)
+    scene = job.prior.nbytes
+    small = 4 * row_width(degree) * count
     rows = 0 if job.plan else dense  # that view.html may show
     chosen = job.config.select.count_of(len(train))
     used = [train if chosen == "auto" else train.take(range(min(chosen, len(train))))] if trains else []
     used += [*views.untrained, *filter(None, [views.twice])]
-    full = [] if views.full is None else [within_pixels(views.full)]
+    full = [] if views.full is None else [limit_pixels(views.full)]
     targets = sum(_target_bytes(part, job.prior if job.renders else None) for part in (used, full))
     kept = _PROGRAM_BYTES + _sampled(_SURVEY, dense) + targets + _image_bytes([*used, *full]) + 2 * small
     packing = _packing_bytes(count, degree)
@@ -171,7 +161,7 @@ def _peak_bytes(job: Any, count: int, page: bool, *, trains: bool) -> int:
 
 def _target_bytes(views: Sequence[Cameras], teacher: Splats | None) -> int:
     """Return the bytes of cached targets: renders in 16 bits, or photos in 8."""
-    values = 3 * sum(int(_pixels(part).sum()) for part in views)
+    values = 3 * sum(int(part.pixels.sum()) for part in views)
     if teacher is not None:
         values *= 2
     return min(CACHE_BYTES, values)
@@ -185,7 +175,7 @@ def _sampled(cost: tuple[int, int], count: int) -> int:
 
 def _image_bytes(views: Sequence[Cameras]) -> int:
     """Return the bytes of rendering and scoring as many of the largest views as there are threads."""
-    largest = max((int(_pixels(part).max()) for part in views if len(part)), default=0)
+    largest = max((int(part.pixels.max()) for part in views if len(part)), default=0)
     return _IMAGE_BYTES * largest * threads_used()
 
 
@@ -193,17 +183,19 @@ def _packing_bytes(count: int, degree: int) -> int:
     return _PACKED_BYTES * count + (_PALETTE_BYTES * palette_size(count) if degree else 0)
 
 
-def check_job_memory(job: Any, most: int | None, need: int) -> None:
+def check_job_memory(job: DistillJob, most: int | None, need: int) -> None:
     """Reject a job that needs more than `most` bytes; None means no limit."""
     if most is None or need <= most:
         return
     count = job.total
-    message = f"--memory: {plural(count, 'Gaussian')} in one piece take about {amount(need, ceil=True)}, "
+    message = (
+        f"--memory: {plural(count, 'Gaussian')} in one piece take about {format_bytes(need, ceil=True)}, "
+    )
     if job.plan is not None:
-        largest = round_counts(job.dense, job.budget.count, job.config)[0]
+        largest = plan_round_counts(job.dense, job.budget.count, job.config)[0]
         message = f"--memory: recovering {plural(largest, 'Gaussian')} takes about "
-        message += f"{amount(need, ceil=True)}, "
-    message += f"more than {amount(most)}; smaller views, --size, take less"
+        message += f"{format_bytes(need, ceil=True)}, "
+    message += f"more than {format_bytes(most)}; smaller views, --size, take less"
     if job.plan is None and job.renders:  # tiles support this job
         tiles = TileMemory(count, 4 * row_width(job.prior.sh_degree), RECOVERY_TIMES)
         message += f"; in tiles {tiles.advice(most, max(1, count // 2))}"

@@ -68,7 +68,7 @@ class Opened:
 
 
 @contextmanager
-def opened(
+def open_tiles(
     source: Source,
     tiling: Tiling,
     times: float,
@@ -109,7 +109,9 @@ def opened(
     plan = plan_tiles(store or stream, tiling, times)
     say(f"{plan.tiles:,} tiles of {plan.count:,} Gaussians, {plan.workers} at a time")
     if planned or store is None:
-        yield Opened(Planned(_sampled(stream, lifting), count=plan.count, tile_rows=tiling.most_rows), plan)
+        yield Opened(
+            Planned(_sample_stream(stream, lifting), count=plan.count, tile_rows=tiling.most_rows), plan
+        )
         return
     with running(plan) as runs:
         workers = Workers(runs, tiling.folder / "steps", progress)
@@ -126,9 +128,12 @@ def _check_model(source: Source, store: TileStore | None) -> None:
         )
 
 
-def _sampled(stream: SceneStream | PointStream, lifting: LiftConfig | None) -> Splats:
+def _sample_stream(stream: SceneStream | PointStream, lifting: LiftConfig | None) -> Splats:
     """Return a sample of a scene or of a lifted cloud that is not in tiles yet."""
-    stride, read, scenes, points = sample_stride(stream.count), 0, [], []
+    stride = sample_stride(stream.count)
+    read = 0
+    scenes = []
+    points = []
     for block in stream.blocks(BLOCK):
         rows = slice(-read % stride, None, stride)
         if isinstance(block, Splats):

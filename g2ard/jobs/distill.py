@@ -18,18 +18,18 @@ from g2ard.config.schema import keywords
 from g2ard.errors import InputError
 from g2ard.io import Source
 from g2ard.io.types import Points
-from g2ard.jobs.budget import Budget, count_of
+from g2ard.jobs.budget import Budget, parse_count
 from g2ard.jobs.chosen_points import PointChoice
-from g2ard.jobs.clean import without_clutter
+from g2ard.jobs.clean import remove_clutter
 from g2ard.jobs.distill_job import DistillJob
 from g2ard.jobs.distill_options import DistillOptions
 from g2ard.jobs.inputs import GivenViews, Views, split_views
 from g2ard.jobs.memory import RECOVERY_TIMES
-from g2ard.jobs.run_views import Use, pool_times, views_of
-from g2ard.jobs.scoring import with_scores
+from g2ard.jobs.run_views import Use, choose_views, find_pool_growth
+from g2ard.jobs.scoring import add_scores
 from g2ard.jobs.simplify import Reduction
-from g2ard.jobs.start import Given, Start, read_start, start_in_tiles
-from g2ard.jobs.start_points import colored_source, is_sparse_file, placed_source
+from g2ard.jobs.start import Given, Start, describe_tiled_start, read_start
+from g2ard.jobs.start_points import colored_source, is_sparse_file, keep_seen_points
 from g2ard.jobs.teaching import Teaching
 from g2ard.pipeline.config import DistillConfig
 from g2ard.pipeline.dense import Dense
@@ -93,7 +93,7 @@ def distill(
             from COLMAP's sparse points, or as a fallback from points along camera rays
             (`g2ard.stages.photo_points`).
         count: Gaussians of the result, at most those of the scene. Photos alone need no budget: see
-            `g2ard.jobs.start_points.usual_count`.
+            `g2ard.jobs.start_points.choose_count`.
         ratio: reduction factor, at least 1.
         fit: largest file, such as "5MB", or a device (see `Budget`).
         min_psnr: PSNR (dB) that simplification alone must keep against the scene, in generated views.
@@ -168,7 +168,7 @@ def distill(
     changed = keywords(distill, DistillConfig(), fields | named)
     budget = None
     if scene is not None or {count, ratio, fit, min_psnr, min_ssim} != {None}:
-        budget = Budget(count_of(count), ratio, fit=fit, min_psnr=min_psnr, min_ssim=min_ssim)
+        budget = Budget(parse_count(count), ratio, fit=fit, min_psnr=min_psnr, min_ssim=min_ssim)
     options = DistillOptions(
         views=views,
         photos=photos,
@@ -188,11 +188,11 @@ def distill(
     done = job.run(work)
     if judgement := job.budget.judge(done.splats):
         say(judgement[1])
-    return with_scores(job, done)
+    return add_scores(job, done)
 
 
 @contextmanager
-def preparing(
+def open_job(
     scene: Given,
     budget: Budget | None,
     options: DistillOptions,
@@ -214,19 +214,21 @@ def preparing(
     if tiling is None:
         yield prepare(scene, budget, options, use=use, planned=planned, **callbacks)
         return
-    from g2ard.jobs.dense import opened
+    from g2ard.jobs.dense import open_tiles
 
     assert isinstance(scene, Source)
     began = time.monotonic()
     if scene.kind == "splats":
         options.check_trained()
-    config, source, split = options.config, scene.drawn_as(options.render_model), None
+    config = options.config
+    source = scene.drawn_as(options.render_model)
+    split = None
     if scene.kind == "points" and options.photo_views is not None:
         split = split_views(options.photo_views, options.held_out, say)
         if not scene.others and is_sparse_file(scene, options.photo_views):
-            source = placed_source(scene, split[0].cameras)
+            source = keep_seen_points(scene, split[0].cameras)
         source = colored_source(source, split[0].cameras, planned=planned)
-    with opened(
+    with open_tiles(
         source, tiling, RECOVERY_TIMES, config.simplify, config.lift, planned=planned, **callbacks
     ) as tiles:
         given = replace(tiles, views=split)
@@ -253,24 +255,26 @@ def prepare(
     Args:
         budget: None chooses a count for photos alone.
         tiles: the scene, if it is in tiles.
-        planned: see `preparing`.
+        planned: see `open_job`.
         began: when the preparation began; None means now.
     """
-    began, recovers = began or time.monotonic(), use != "merging"
+    began = began or time.monotonic()
+    recovers = use != "merging"
     seed = options.config.recover.seed  # rejects invalid settings before anything is read
     if tiles is None:
         start = read_start(scene, budget, options, progress, say, planned=planned)
     else:
         assert isinstance(scene, Source)
-        start = start_in_tiles(scene, options, tiles, say)
+        start = describe_tiled_start(scene, options, tiles, say)
     budget = budget or Budget(count=start.usual)
-    dense, cleaned = start.dense, None
+    dense = start.dense
+    cleaned = None
     if options.clean and planned:
         say("--clean: only the run finds what to remove; counts are of the whole scene")
     elif options.clean:
-        dense, cleaned = without_clutter(dense, seed=seed, progress=progress, say=say)
+        dense, cleaned = remove_clutter(dense, seed=seed, progress=progress, say=say)
     usual = max(1, dense.total // _USUAL_RATIO)
-    views = views_of(
+    views = choose_views(
         dense,
         options,
         usual if budget.is_measured else budget.of(dense.total, start.name),
@@ -282,7 +286,8 @@ def prepare(
         progress=progress,
         say=say,
     )
-    cameras, plan = views.train.cameras, None if tiles is None else tiles.plan
+    cameras = views.train.cameras
+    plan = None if tiles is None else tiles.plan
     reduce = Reduction(
         dense,
         cameras=cameras,
@@ -295,28 +300,32 @@ def prepare(
         say=say,
     )
     sh_degree = 3 if start.needs_photos else None  # points have one colour each, photos show more
-    degree = options.configured(sh_degree=sh_degree).recover.sh_degree
-    wanted = reduce.resolved(budget, start.name, f"scene.{options.format}", degree)
-    teaching = _teaching(options, start, dense, views, planned=planned, say=say)
+    degree = options.configure(sh_degree=sh_degree).recover.sh_degree
+    wanted = reduce.resolve(budget, start.name, f"scene.{options.format}", degree)
+    teaching = _choose_teaching(options, start, dense, views, planned=planned, say=say)
     measured_in = cameras if teaching.photos and not planned else None
-    regularizers, why, measures = _regularizers(options, start, dense.sample, measured_in)
+    regularizers, why, measures = _choose_regularizers(options, start, dense.sample, measured_in)
     teaching.propose_background(cameras)
     if start.given:
         shown = dense.sample
         if start.needs_photos and tiles is None:
             shown = start.dense.sample.take(np.arange(start.given))
         teaching.check_photos(shown, cameras, renders=not start.needs_photos)
-    say(_task(start, wanted.count, dense.total, cameras if recovers else None, photos=teaching.photos))
+    say(
+        _describe_task(
+            start, wanted.count, dense.total, cameras if recovers else None, photos=teaching.photos
+        )
+    )
     if not start.from_photos and wanted.count == dense.total:
         one = "point" if start.lifted else "Gaussian"
         say(f"nothing to simplify: the scene has {plural(dense.total, one)}")
     if recovers:
         say(Detail(f"regularisers: {why}"))
-    config = options.configured(regularizers, sh_degree)
+    config = options.configure(regularizers, sh_degree)
     if start.from_photos:
-        recover = _for_photos(config.recover, options)
+        recover = _adapt_to_photos(config.recover, options)
     else:
-        recover = _grown(config.recover, dense, cameras, of_photos=teaching.render is None)
+        recover = _grow_steps(config.recover, dense, cameras, of_photos=teaching.render is None)
     if teaching.photos:  # photos exist only for given poses
         views = replace(views, validation=None, apart=None)
     return DistillJob(
@@ -339,25 +348,25 @@ def prepare(
     )
 
 
-def _for_photos(recover: RecoverConfig, options: DistillOptions) -> RecoverConfig:
+def _adapt_to_photos(recover: RecoverConfig, options: DistillOptions) -> RecoverConfig:
     """Return the settings of a start from photos: all scales of images count unless one was chosen."""
     schedule = recover.schedule
-    chosen = isinstance(options.named("recover.schedule"), Schedule)
-    if not chosen and options.named("recover.schedule.finest") is None:
+    chosen = isinstance(options.find("recover.schedule"), Schedule)
+    if not chosen and options.find("recover.schedule.finest") is None:
         schedule = replace(schedule, finest=0.0)
     return replace(recover, schedule=schedule, from_points=True)
 
 
-def _grown(recover: RecoverConfig, dense: Dense, cameras: Cameras, *, of_photos: bool) -> RecoverConfig:
+def _grow_steps(recover: RecoverConfig, dense: Dense, cameras: Cameras, *, of_photos: bool) -> RecoverConfig:
     """Return the settings with more steps for a large scene, whose pool of views grows with it."""
-    times = pool_times(dense.total)
+    times = find_pool_growth(dense.total)
     if recover.steps is not None or recover.recovery_time is not None or of_photos or times == 1:
         return recover
     needed = recover.final_steps(dense.sample, cameras, of_photos=of_photos)
     return replace(recover, steps=round(needed * times))
 
 
-def _teaching(
+def _choose_teaching(
     options: DistillOptions, start: Start, dense: Dense, views: RunViews, *, planned: bool, say: Say
 ) -> Teaching:
     """Decide whether photos are targets, and whether renders of the dense scene are, at least elsewhere."""
@@ -378,14 +387,14 @@ def _teaching(
         partial(dense.images, background=background) if renders else None,
         photos,
         background,
-        chosen=options.named("recover.background") is not None,
+        chosen=options.find("recover.background") is not None,
         insisted=options.photos is True,
         rough=planned,
         say=say,
     )
 
 
-def _regularizers(
+def _choose_regularizers(
     options: DistillOptions, start: Start, prior: Splats, photos: Cameras | None
 ) -> tuple[Regularizers, str, PriorMeasures]:
     """Choose regularisers with `choose_regularizers`, or none for points of photos.
@@ -393,8 +402,8 @@ def _regularizers(
     Args:
         photos: training views, if they have photos; only then is their consistency measured.
     """
-    kind = options.named("recover.regularizers") or "auto"
-    paper = options.named("recover.schedule") == "paper"
+    kind = options.find("recover.regularizers") or "auto"
+    paper = options.find("recover.schedule") == "paper"
     if start.from_photos and kind == "auto" and not paper:
         why = "none; points from photos are rough, and move freely"
         return FREE, why, measure_prior(prior)
@@ -403,7 +412,7 @@ def _regularizers(
     return choose_regularizers(kind, prior, photos, paper=paper)
 
 
-def _task(start: Start, count: int, total: int, train: Cameras | None, *, photos: bool) -> str:
+def _describe_task(start: Start, count: int, total: int, train: Cameras | None, *, photos: bool) -> str:
     """Describe the task in one line; `train` are the views of recovery, if there is one."""
     source = plural(total, "point") if start.lifted else f"{total:,}"
     counts = f"{source} → {plural(count, 'Gaussian')}"

@@ -18,10 +18,10 @@ from g2ard.jobs.run_views import is_untouched
 from g2ard.jobs.teaching import RunTargets, Teaching
 from g2ard.pipeline.config import DistillConfig
 from g2ard.pipeline.dense import Dense
-from g2ard.pipeline.distill import Distilled, RunViews, round_counts
+from g2ard.pipeline.distill import Distilled, RunViews, plan_round_counts
 from g2ard.pipeline.distill import distill as pipeline
 from g2ard.progress import Progress, Say, silent, unsaid
-from g2ard.rendering.targets import Subset, Targets, fill
+from g2ard.rendering.targets import Subset, fill
 from g2ard.scene.samples import evenly_spaced, take_evenly
 from g2ard.scene.splats import Splats
 from g2ard.stages.evaluate import evaluate
@@ -103,7 +103,7 @@ class DistillJob:
         recover = self.config.recover
         like = take_evenly(self.prior, count)
         last = recover.final_steps(like, self.views.train.cameras, of_photos=self.teaching.photos)
-        rounds = round_counts(self.dense, count, self.config)
+        rounds = plan_round_counts(self.dense, count, self.config)
         return last + len(rounds) * recover.schedule.round_steps
 
     @cached_property
@@ -119,7 +119,7 @@ class DistillJob:
         limited = None if self.time is None else partial(self.time_left, self.time)
         done = self.reduce(self.dense, self.budget.count, work, time_left=limited)
         splats = self.budget.shrink(done.splats, self.say)
-        return replace(done, splats=splats, held_out=done.scored_on(targets.held_out))
+        return replace(done, splats=splats, held_out=done.match_exposures(targets.held_out))
 
     def reduce(
         self,
@@ -165,9 +165,6 @@ class DistillJob:
         began = time.monotonic()
         evaluate(self.prior, some, background=self.config.recover.background)
         seconds = time.monotonic() - began
-        scored = [targets.held_out, targets.apart, targets.twice]
-        return 2 * seconds * sum(map(_count_pixels, filter(None, scored))) / _count_pixels(some)
-
-
-def _count_pixels(targets: Targets) -> int:
-    return int(targets.cameras.widths @ targets.cameras.heights)
+        scored = filter(None, (targets.held_out, targets.apart, targets.twice))
+        pixels = sum(int(part.cameras.pixels.sum()) for part in scored)
+        return 2 * seconds * pixels / int(some.cameras.pixels.sum())

@@ -13,7 +13,7 @@ from g2ard.config.schema import Settings, full_paths, values_of
 from g2ard.errors import InputError
 from g2ard.jobs.inputs import Views
 from g2ard.pipeline.config import DistillConfig
-from g2ard.pipeline.presets import PRESETS, configured
+from g2ard.pipeline.presets import PRESETS, configure
 from g2ard.stages.lift import LiftConfig
 from g2ard.stages.recover.anchors import Regularizers
 from g2ard.system.cached import cached_property
@@ -58,7 +58,7 @@ class DistillOptions(Settings):
     @cached_property
     def config(self) -> DistillConfig:
         """Configuration before the scene is measured; its regularisers are a trained scene's unless named."""
-        return self.configured()
+        return self.configure()
 
     @property
     def focus(self) -> Focus | None:
@@ -72,7 +72,7 @@ class DistillOptions(Settings):
         """Given views whose photos a point cloud learns from."""
         return None if is_made(self.views) or self.photos is False else self.views
 
-    def configured(
+    def configure(
         self, regularizers: Regularizers | None = None, sh_degree: int | None = None
     ) -> DistillConfig:
         """Return the configuration with measured regularisers and a default SH degree."""
@@ -87,7 +87,7 @@ class DistillOptions(Settings):
             settings.setdefault("recover.sh_degree", sh_degree)
         if regularizers is not None:
             settings["recover.regularizers"] = regularizers
-        return configured(DistillConfig(), self.preset, settings)
+        return configure(DistillConfig(), self.preset, settings)
 
     def check_trained(self) -> None:
         """Reject settings that only point clouds use, because the scene is a trained one."""
@@ -95,7 +95,7 @@ class DistillOptions(Settings):
             if self._full.get(path, default) != default:
                 raise InputError("has no effect on a trained scene, only on point clouds", parameter=path)
 
-    def named(self, path: str) -> Any:
+    def find(self, path: str) -> Any:
         """Return the value of a path in the settings or the preset, or None."""
         return self._full.get(path, PRESETS.get(self.preset, {}).get(path))
 

@@ -35,20 +35,23 @@ _FAR = 0.05
 """Share of the Gaussians beyond a gap above which the scene has a sky or surroundings."""
 
 
-def doubts_of_views(scene: Splats, cameras: Cameras) -> list[str]:
+def doubt_views(scene: Splats, cameras: Cameras) -> list[str]:
     """Return warnings about views that frame little, show it below a pixel, or stand outside a sky."""
-    some = _visible(scene)
+    some = _sample_visible(scene)
     if len(some) < _FEWEST or not len(cameras):
         return []
-    points, sizes = _points(some), _sizes(some)
+    points = _find_points(some)
+    sizes = _measure_sizes(some)
     framed, resolved = np.zeros((2, len(some)), bool)
     for view in cameras:
         depths = (points - view.position) @ view.viewmat[2, :3]
         rows = view.holds(points)
         framed |= rows
         resolved |= rows & (sizes * np.sqrt(view.K[0, 0] * view.K[1, 1]) >= depths)
-    told, seen = [], max(1, int(framed.sum()))
-    unframed, coarse = 1 - float(framed.mean()), 1 - float(resolved.sum()) / seen
+    told = []
+    seen = max(1, int(framed.sum()))
+    unframed = 1 - float(framed.mean())
+    coarse = 1 - float(resolved.sum()) / seen
     if unframed > _UNFRAMED:
         told.append(f"warning: {unframed:.0%} of the scene is in no view; --views of all of it would show it")
     elif coarse > _COARSE:
@@ -66,27 +69,27 @@ def doubts_of_views(scene: Splats, cameras: Cameras) -> list[str]:
     return told
 
 
-def doubts_of_merging(scene: Splats, small: Splats, *, blind: bool) -> list[str]:
+def doubt_merging(scene: Splats, small: Splats, *, blind: bool) -> list[str]:
     """Return warnings about the result of a reduction, `blind` if it had no views."""
     if len(scene) < _FEWEST:
         return []
-    votes = _votes(scene)
-    found = _doubts_of_regions(scene, small, votes)
-    return found + _doubts_of_distances(votes) if blind else found
+    votes = _cast_votes(scene)
+    found = _doubt_regions(scene, small, votes)
+    return found + _doubt_distances(votes) if blind else found
 
 
-def _doubts_of_regions(scene: Splats, small: Splats, votes: Votes) -> list[str]:
+def _doubt_regions(scene: Splats, small: Splats, votes: Votes) -> list[str]:
     """Return a warning if an eighth of the scene, or what is near, lost ten times more than the whole."""
     every = max(1, len(scene) // _REGION_ROWS)
-    before = _points(scene)[::every]
-    after = _points(small)
+    before = _find_points(scene)[::every]
+    after = _find_points(small)
     if len(before) < _FEWEST or not len(after):
         return []
     regions = [(before, after)]
     for _ in range(_LEVELS):
-        regions = [half for region in regions for half in _halved(*region)]
+        regions = [half for region in regions for half in _halve_region(*region)]
     if np.isfinite(votes.radius):
-        regions.append((_within(before, votes), _within(after, votes)))
+        regions.append((_take_within(before, votes), _take_within(after, votes)))
     ratio = len(before) / len(after)
     factors = [len(old) / max(1, len(new)) / ratio for old, new in regions]
     emptied = [i for i, factor in enumerate(factors) if factor > _EMPTIED]
@@ -101,7 +104,7 @@ def _doubts_of_regions(scene: Splats, small: Splats, votes: Votes) -> list[str]:
     ]
 
 
-def _doubts_of_distances(votes: Votes) -> list[str]:
+def _doubt_distances(votes: Votes) -> list[str]:
     """Return a warning if the scene has a sky or distant surroundings."""
     far = float(votes.weights[votes.distances > votes.radius].sum())
     if far <= _FAR:
@@ -112,33 +115,33 @@ def _doubts_of_distances(votes: Votes) -> list[str]:
     ]
 
 
-def _visible(scene: Splats) -> Splats:
+def _sample_visible(scene: Splats) -> Splats:
     rows = np.flatnonzero(scene.opacities > 1 / 255)
     some = scene.take(rows[canonical_order(scene, rows, _SAMPLE)])
     return some.take(some.finite_rows())
 
 
-def _points(scene: Splats) -> Floats:
-    means = scene.means.astype(np.float64)
-    return means[np.isfinite(means).all(axis=1)] + scene.offset
+def _find_points(scene: Splats) -> Floats:
+    points = scene.positions
+    return points[np.isfinite(points).all(axis=1)]
 
 
-def _sizes(scene: Splats) -> Floats:
+def _measure_sizes(scene: Splats) -> Floats:
     scales = np.sort(np.abs(scene.scales.astype(np.float64)), axis=1)
     return np.sqrt(scales[:, 1] * scales[:, 2])
 
 
-def _votes(scene: Splats) -> Votes:
-    some = _visible(scene)
+def _cast_votes(scene: Splats) -> Votes:
+    some = _sample_visible(scene)
     represents = len(scene) / max(1, len(some))
-    return Votes.of(_points(some), _sizes(some), some.opacities.astype(np.float64), represents)
+    return Votes.of(_find_points(some), _measure_sizes(some), some.opacities.astype(np.float64), represents)
 
 
-def _within(points: Floats, votes: Votes) -> Floats:
+def _take_within(points: Floats, votes: Votes) -> Floats:
     return points[norms(points - votes.centre) <= votes.radius]
 
 
-def _halved(before: Floats, after: Floats) -> list[tuple[Floats, Floats]]:
+def _halve_region(before: Floats, after: Floats) -> list[tuple[Floats, Floats]]:
     """Halve a region along its widest axis."""
     axis = int(np.argmax(np.ptp(before, axis=0)))
     cut = np.median(before[:, axis])

@@ -11,7 +11,7 @@ from g2ard.errors import InputError
 from g2ard.io.scene_formats import scene_format
 from g2ard.io.scenes import read_back
 from g2ard.io.spz import names_axes
-from g2ard.jobs.budget_search import clipped_images, quality
+from g2ard.jobs.budget_search import measure_quality, render_clipped
 from g2ard.poses import plan_pool
 from g2ard.report.run import WARNED_FORMAT_LOSS, better_format
 from g2ard.scene.splats import Splats
@@ -29,7 +29,7 @@ _MOST_COMPARED_GAUSSIANS = 2_000_000
 """Gaussians above which scenes are not compared."""
 
 
-def loss_warning(path: Path, splats: Splats, options: dict[str, Any]) -> str | None:
+def describe_format_loss(path: Path, splats: Splats, options: dict[str, Any]) -> str | None:
     """Compare a written file with its scene in a few small generated views; return a warning if a scene of
     35 dB would lose more than 1 dB.
 
@@ -45,7 +45,7 @@ def loss_warning(path: Path, splats: Splats, options: dict[str, Any]) -> str | N
     unnamed = options.get("axes") == "RDF" and options.get("spz_version", 3) != 4  # so read as RUB
     if unnamed and not names_axes(path):
         stored = with_axes(stored, change_of_axes("RDF", "RUB"))
-    away = quality(clipped_images(splats, cameras), stored, cameras).psnr
+    away = measure_quality(render_clipped(splats, cameras), stored, cameras).psnr
     lowered = -10 * float(np.log10(10 ** (-_GOOD_PSNR / 10) + 10 ** (-away / 10)))
     if _GOOD_PSNR - lowered <= WARNED_FORMAT_LOSS:
         return None

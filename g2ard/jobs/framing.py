@@ -58,7 +58,7 @@ _EMPTY = 0.05
 """Share of a photo without matter above which emptiness is what photos show."""
 
 
-def fields_of(
+def choose_fields(
     view: Camera,
     *,
     subject: NDArray[np.float64] | None = None,
@@ -74,38 +74,38 @@ def fields_of(
             shows hardly anything that photos did not see.
 
     >>> view = Camera.facing([0, -1, 0], [0, 0, 0], width=40, height=30, fov=60)
-    >>> [(round(aspect, 2), round(degrees)) for aspect, degrees in fields_of(view)]
+    >>> [(round(aspect, 2), round(degrees)) for aspect, degrees in choose_fields(view)]
     [(0.1, 160), (1.33, 47), (10.0, 47)]
     """
-    across, down = _halves(view)
+    across, down = _measure_halves(view)
     if subject is not None:
-        across, down = _extent(view, subject)
+        across, down = _measure_extent(view, subject)
     aspects = np.array(sorted({across / down, *(_EXTREMES if cameras is None else _ASPECTS)}))
     halves = np.maximum(down, across / aspects)
     if cameras is not None and scene is not None:
-        halves = _narrowed(halves, aspects, view, scene, cameras)
+        halves = _narrow_windows(halves, aspects, view, scene, cameras)
     return tuple(zip(aspects.tolist(), np.degrees(2 * np.arctan(halves)).tolist(), strict=True))
 
 
-def _halves(view: Camera) -> tuple[float, float]:
+def _measure_halves(view: Camera) -> tuple[float, float]:
     """Return half the width and height of a view at distance 1."""
     return float(view.width / view.K[0, 0] / 2), float(view.height / view.K[1, 1] / 2)
 
 
-def _extent(view: Camera, points: NDArray[np.float64]) -> tuple[float, float]:
+def _measure_extent(view: Camera, points: NDArray[np.float64]) -> tuple[float, float]:
     """Return half the width and height, at distance 1, around most of the points in a view."""
     held = points[view.holds(points)]
     if not len(held):
-        return _halves(view)
+        return _measure_halves(view)
     x, y, z = view.viewmat[:3, :3] @ (held - view.position).T
     across, down = (
         max(_FINEST * most, _MARGIN * float(np.quantile(np.abs(along / z), _SUBJECT)))
-        for along, most in zip((x, y), _halves(view), strict=True)
+        for along, most in zip((x, y), _measure_halves(view), strict=True)
     )
     return across, down
 
 
-def _narrowed(
+def _narrow_windows(
     halves: NDArray[np.float64],
     aspects: NDArray[np.float64],
     view: Camera,
@@ -114,7 +114,7 @@ def _narrowed(
 ) -> NDArray[np.float64]:
     """Return half heights of windows that show little else than what photos saw, at most the given ones."""
     reach = float((halves * np.maximum(1, aspects)).max())
-    across, down, seen = _surroundings(view, scene, cameras, reach)
+    across, down, seen = _look_around(view, scene, cameras, reach)
     narrowed = halves.copy()
     for row, (half, aspect) in enumerate(zip(halves, aspects, strict=True)):
         for narrowed[row] in np.geomspace(half, _FINEST * half, _STEPS):
@@ -124,7 +124,7 @@ def _narrowed(
     return narrowed
 
 
-def _surroundings(
+def _look_around(
     view: Camera, scene: Splats, cameras: Cameras, reach: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
     """Look beyond a photo's edges.
@@ -133,9 +133,10 @@ def _surroundings(
         |x|, |y| at distance 1 and whether photos saw it, of each pixel of a square picture whose sides are
         2 · `reach` at distance 1.
     """
-    focal, middle = _SIDE / (2 * reach), _SIDE / 2
+    focal = _SIDE / (2 * reach)
+    middle = _SIDE / 2
     K = np.array([[focal, 0, middle], [0, focal, middle], [0, 0, 1]])
-    renderer = Renderer(_thinned(scene))
+    renderer = Renderer(_thin_scene(scene))
     drawn = renderer.render(Camera(view.viewmat, K, _SIDE, _SIDE), median=True)
     assert drawn.median is not None
     y, x = (np.mgrid[:_SIDE, :_SIDE].reshape(2, -1) + 0.5 - middle) / focal
@@ -144,15 +145,15 @@ def _surroundings(
     witnesses = np.zeros(len(surface), np.int64)
     some = take_evenly(cameras, _PHOTOS).scaled(_PHOTO_SIDE)
     for photo in some:
-        witnesses += _sees(renderer, photo, surface)
-    own = (np.abs(x) <= _halves(view)[0]) & (np.abs(y) <= _halves(view)[1])
+        witnesses += _find_seen(renderer, photo, surface)
+    own = (np.abs(x) <= _measure_halves(view)[0]) & (np.abs(y) <= _measure_halves(view)[1])
     empty = depth <= 0
     known = witnesses >= min(_WITNESSES, len(some))
     known[empty] = empty[own].mean() > _EMPTY
     return np.abs(x), np.abs(y), known | own
 
 
-def _sees(renderer: Renderer, photo: Camera, points: NDArray[np.float64]) -> NDArray[np.bool_]:
+def _find_seen(renderer: Renderer, photo: Camera, points: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Return which of the (N, 3) points are what a photo shows first."""
     depths = renderer.render(photo, median=True).median
     assert depths is not None
@@ -164,7 +165,7 @@ def _sees(renderer: Renderer, photo: Camera, points: NDArray[np.float64]) -> NDA
     return seen
 
 
-def _thinned(scene: Splats) -> Splats:
+def _thin_scene(scene: Splats) -> Splats:
     """Return a sample of a large scene, its Gaussians widened so that surfaces stay closed."""
     if len(scene) <= _ROWS:
         return scene

@@ -76,7 +76,7 @@ def load_scene(
     return splats
 
 
-def axes_of(cloud: Cloud, name: str, say: Say = unsaid, progress: Progress = silent) -> Axes:
+def find_axes(cloud: Cloud, name: str, say: Say = unsaid, progress: Progress = silent) -> Axes:
     """Return the axes of a cloud's coordinates; if neither its format nor a map tells, guess and say so."""
     if cloud.axes is not None:
         return cloud.axes
@@ -95,10 +95,10 @@ def read_points(source: Source, name: str, say: Say, *, bare: bool = False) -> C
     return cloud
 
 
-def lifted_cloud(source: Source, progress: Progress = silent, say: Say = unsaid) -> Splats:
+def lift_cloud(source: Source, progress: Progress = silent, say: Say = unsaid) -> Splats:
     """Read a point cloud, report its notes, and lift it."""
     cloud = read_points(source, str(source), say)
-    axes = axes_of(cloud, str(source), say, progress)
+    axes = find_axes(cloud, str(source), say, progress)
     splats = lift(cloud.points.positions, cloud.points.colors, axes=axes, progress=progress)
     discs = plural(len(splats), "disc")
     say(f"{source}: {plural(len(cloud.points), 'point')} lifted to {discs}, as `g2ard lift` does")
@@ -134,8 +134,8 @@ def load_view_sets(
     views: Views, splits: Sequence[Split], size: int | None, say: Say = unsaid, *, unpictured: bool = False
 ) -> list[ViewSet]:
     """Read views once and return several splits at a longer side, with their weights."""
-    found, path = _read(views, say, unpictured=unpictured)
-    return [found.take(_mask(found, path, split)).fitted(size) for split in splits]
+    found, path = _read_views(views, say, unpictured=unpictured)
+    return [found.take(_choose_split(found, path, split)).fitted(size) for split in splits]
 
 
 def split_views(
@@ -152,7 +152,8 @@ def split_views(
     if held_out is None:
         train, test = load(views, ["train", "test"])
         return train, test.cameras
-    (train,), (test,) = load(views, [for_training]), load(held_out, [for_scores])
+    (train,) = load(views, [for_training])
+    (test,) = load(held_out, [for_scores])
     return drop_held_out(train, test.cameras, say), test.cameras
 
 
@@ -173,14 +174,15 @@ def load_split_views(
     views: Views, split: str, say: Say = unsaid, *, unpictured: bool = False
 ) -> tuple[ViewSet, NDArray[np.bool_]]:
     """Read all views with their splits, stated or by the rule, and the mask of the views in `split`."""
-    found, path = _read(views, say, unpictured=unpictured)
-    mask = _mask(found, path, split)
+    found, path = _read_views(views, say, unpictured=unpictured)
+    mask = _choose_split(found, path, split)
     return replace(found, splits=splits_of(path, found.cameras.names, found.splits)), mask
 
 
-def _mask(views: ViewSet, path: Path | None, split: Split) -> NDArray[np.bool_]:
+def _choose_split(views: ViewSet, path: Path | None, split: Split) -> NDArray[np.bool_]:
     """Return the mask of the views in a split; a photo of the test split trains under no other name."""
-    names, photos = views.cameras.names, views.cameras.image_paths
+    names = views.cameras.names
+    photos = views.cameras.image_paths
     choose = partial(split_mask, which=split) if isinstance(split, str) else split
     mask: NDArray[np.bool_] = choose(path, names, stated=views.splits)
     if split != "train" and (split is not for_training or not states_splits(path, views.splits)):
@@ -192,7 +194,7 @@ def _mask(views: ViewSet, path: Path | None, split: Split) -> NDArray[np.bool_]:
     return left
 
 
-def _read(views: Views, say: Say, *, unpictured: bool = False) -> tuple[ViewSet, Path | None]:
+def _read_views(views: Views, say: Say, *, unpictured: bool = False) -> tuple[ViewSet, Path | None]:
     """Return the views, and their path if they were read."""
     if isinstance(views, ViewSet):
         return views, None
@@ -204,7 +206,7 @@ def _read(views: Views, say: Say, *, unpictured: bool = False) -> tuple[ViewSet,
     return views_read, views.path if isinstance(views, ViewFiles) else Path(views)
 
 
-def scorable(targets: Targets, say: Say = unsaid) -> Targets:
+def drop_unscorable(targets: Targets, say: Say = unsaid) -> Targets:
     """Return the targets that have a valid pixel, and report the number of the others."""
     kept = with_pixels(targets)
     if skipped := len(targets.cameras) - len(kept.cameras):

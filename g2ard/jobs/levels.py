@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Generic, Literal, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, Literal, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,15 +20,14 @@ from g2ard.errors import InputError
 from g2ard.io import Source
 from g2ard.io.reports import Report
 from g2ard.io.scenes import tell
-from g2ard.io.tile_store import TileStore
 from g2ard.jobs.budget import Budget
-from g2ard.jobs.comparison import made_of_points
+from g2ard.jobs.comparison import is_made_of_points
 from g2ard.jobs.cost import TRAINER_BYTES, Cost, cost_of
-from g2ard.jobs.distill import preparing
+from g2ard.jobs.distill import open_job
 from g2ard.jobs.distill_job import DistillJob
 from g2ard.jobs.distill_options import DistillOptions
 from g2ard.jobs.inputs import GivenViews, Views, load_scene
-from g2ard.jobs.viewer_frame import backdrop, frame_of, up_of
+from g2ard.jobs.viewer_frame import choose_backdrop, choose_frame, up_of
 from g2ard.levels.tileset import TILE_OF_SCENE, Georeference, is_outside, map_system, metres_of
 from g2ard.levels.tileset import save_tileset as write_tileset
 from g2ard.levels.tree import Cut, Level, aligned
@@ -87,7 +86,7 @@ class LevelReport(Report):
         return f"level {number}: {plural(self.count, 'Gaussian')}{told}"
 
 
-L = TypeVar("L", Splats, TileStore)
+L = TypeVar("L", bound=Level, covariant=True)
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,7 +123,7 @@ class LevelsJob:
     def sizes(self) -> list[int]:
         """Longer side in pixels of each level's views."""
         cameras = self.job.views.train.cameras
-        longest = int(max(cameras.widths.max(), cameras.heights.max()))
+        longest = int(cameras.sides.max())
         shrunk = (max(_SMALLEST_VIEW_SIDE, round(longest / ratio**0.25)) for ratio in self.ratios)
         return [longest if ratio == 1 else size for ratio, size in zip(self.ratios, shrunk, strict=True)]
 
@@ -137,7 +136,7 @@ class LevelsJob:
             for count, size in zip(self.counts, self.sizes, strict=True)
         ]
 
-    def run(self, work: Path | None = None) -> Levels[Any]:
+    def run(self, work: Path | None = None) -> Levels[Level]:
         """Make the levels; `work` is the folder for resuming.
 
         Each is merged from the one before as it was merged. The job returns a level, the same before
@@ -146,12 +145,13 @@ class LevelsJob:
         job = self.job
         from g2ard.tiles.dense import InTiles
 
-        levels: list[Any] = []
+        levels: list[Level] = []
         reports: list[LevelReport] = []
         finer: Dense = job.dense
         scene = finer
         for ratio, count, size in zip(self.ratios, self.counts, self.sizes, strict=True):
-            began, level = time.perf_counter(), scene
+            began = time.perf_counter()
+            level = scene
             scores: list[float | None] = []
             if ratio > 1:
                 level, finer, *scores = self._level(finer, count, size, work)
@@ -173,20 +173,21 @@ class LevelsJob:
             done = job.reduce(finer, count, work)
             lost = job.dense.opacity_lost(done.splats, held_out.cameras)
             say_gaps(lost, job.say, f"give levels more Gaussians (--ratios), here {count:,}")
-            on = done.scored_on(held_out)
-            level, merged = InMemory(done.splats), InMemory(done.simplified)
-            return level, merged, _mean_psnr(job, merged, on), _mean_psnr(job, level, on)
+            on = done.match_exposures(held_out)
+            level = InMemory(done.splats)
+            merged = InMemory(done.simplified)
+            return level, merged, _measure_psnr(job, merged, on), _measure_psnr(job, level, on)
         if job.recovers:
             job.say(f"{plural(count, 'Gaussian')} are too many for the memory to recover: merged only")
         cameras = self.job.views.merging or self.job.views.train.cameras  # at full size
         config = job.config.simplify
-        small = finer.merged(count, cameras, config, gaps=True, progress=job.progress)
+        small = finer.merge(count, cameras, config, gaps=True, progress=job.progress)
         say_gaps(small.report.opacity_lost, job.say)
-        derived = finer.derived(small.splats, "merged")
-        return derived, derived, _mean_psnr(job, derived, held_out), None
+        derived = finer.derive(small.splats, "merged")
+        return derived, derived, _measure_psnr(job, derived, held_out), None
 
 
-def _mean_psnr(job: DistillJob, scene: Dense, on: Targets) -> float:
+def _measure_psnr(job: DistillJob, scene: Dense, on: Targets) -> float:
     """Return the mean PSNR of a level in some views."""
     background = job.config.recover.background
     if isinstance(scene, InMemory):
@@ -197,7 +198,7 @@ def _mean_psnr(job: DistillJob, scene: Dense, on: Targets) -> float:
 
 
 @contextmanager
-def preparing_levels(
+def open_levels(
     scene: Splats | Source,
     tiling: Tiling | None = None,
     *,
@@ -234,7 +235,7 @@ def preparing_levels(
     settings = {"recover.background": background, "recover.seed": seed}
     settings |= {} if steps is None else {"recover.steps": steps}
     inputs.setdefault("photos", False)
-    with preparing(
+    with open_job(
         scene,
         Budget(ratio=ratios[-1]),
         DistillOptions(settings=settings, **inputs),
@@ -307,7 +308,7 @@ def lod(
     >>> [len(level) for level in lod(ball, ratios=(1, 4, 8), steps=3, size=48).splats]
     [800, 200, 100]
     """
-    with preparing_levels(
+    with open_levels(
         scene if isinstance(scene, Splats) else Source(scene, render_model),
         ratios=ratios,
         recover=recover,
@@ -323,7 +324,7 @@ def lod(
         beside=beside,
         up=up,
     ) as job:
-        return job.run(work)
+        return cast("Levels[Splats]", job.run(work))  # not in tiles
 
 
 def check_ratios(ratios: Sequence[float]) -> None:
@@ -396,11 +397,11 @@ def save_tileset(
                 f"warning: the scene lies outside the area of {name}; is it in that map system and its unit?"
             )
     elif place is not None:
-        told(_extent_line(near[-1], metres, known=unit is not None))
+        told(_describe_extent(near[-1], metres, known=unit is not None))
     size, notes = write_tileset(
         path,
         levels,
-        axis=tileset_up(near, None, told) if up is None else up,
+        axis=choose_tileset_up(near, None, told) if up is None else up,
         place=place,
         unit=metres,
         cut=cut,
@@ -412,7 +413,7 @@ def save_tileset(
     return size
 
 
-def _extent_line(coarsest: Level, metres: float, *, known: bool) -> str:
+def _describe_extent(coarsest: Level, metres: float, *, known: bool) -> str:
     """Describe the extent of a scene, and warn if it is improbable."""
     some = take_evenly(coarsest, _UP_SAMPLE, floor=True)
     low, high = np.percentile(some.means, (1, 99), axis=0)
@@ -427,7 +428,7 @@ _PROBABLE = 0.1, 20_000.0
 """Least and largest probable extent of a scene on a globe, metres."""
 
 
-def tileset_up(
+def choose_tileset_up(
     levels: Sequence[Level], up: Sequence[float] | None = None, say: Say = unsaid
 ) -> NDArray[np.float64]:
     """Return the (3,) up direction for 3D Tiles: `up`, z in map coordinates, or an estimate."""
@@ -458,20 +459,21 @@ def write_level_page(
     Args:
         levels: the levels in the folder, finest first.
         kind: streamed SOG, or 3D Tiles with z up.
-        given: see `g2ard.jobs.viewer_frame.frame_of`. The page's title names the scene, or else the folder.
-        background: see `g2ard.jobs.viewer_frame.backdrop`.
+        given: see `g2ard.jobs.viewer_frame.choose_frame`. The page's title names the scene, or the folder.
+        background: see `g2ard.jobs.viewer_frame.choose_backdrop`.
         source: the source of the scene beside `given`, if it is open.
     """
     coarse = levels[-1]
     few = take_evenly(coarse, _ROWS, floor=True)
-    frame = frame_of(few, given)
+    frame = choose_frame(few, given)
     finest = take_evenly(levels[0], _ROWS, floor=True)
-    of_points = given.beside is not None and made_of_points(Path(given.beside), source)
-    behind = backdrop(background, [finest], of_points=of_points)
-    page, offset = folder / "index.html", np.asarray(few.offset)
+    of_points = given.beside is not None and is_made_of_points(Path(given.beside), source)
+    behind = choose_backdrop(background, [finest], of_points=of_points)
+    page = folder / "index.html"
+    offset = np.asarray(few.offset)
     title = name_scenes([Path(given.beside or folder)])[0]
     if kind == "sog":
-        rotation, position = frame.placed(offset, few.axes)
+        rotation, position = frame.place(offset, few.axes)
         placed: dict[str, Any] = {"rotation": rotation, "position": position}
         antialiased = few.antialiased
         return write_stream_page(

@@ -80,18 +80,20 @@ class TileMemory:
 
         a_row = _HALO_TIMES * (self.of(1) - _TASK_BYTES)
         least = min(max(_LEAST_ROWS, -(-self.count // MOST_TILES)), most)
-        rows = _rounded_down(min((memory - _TASK_BYTES) / a_row, most))
+        rows = _round_down(min((memory - _TASK_BYTES) / a_row, most))
         if rows >= least:
             return f"{cut_into(self.folder, rows)} takes less"
-        need = amount(self.of(round(_HALO_TIMES * least)), ceil=True)
+        need = format_bytes(self.of(round(_HALO_TIMES * least)), ceil=True)
         return f"the least that tiles take is about {need}, with {cut_into(self.folder, least)}"
 
 
-def amount(size: float, *, ceil: bool = False) -> str:
+def format_bytes(size: float, *, ceil: bool = False) -> str:
     """Format bytes: whole megabytes below a gigabyte, at most two decimals above.
 
-    >>> amount(207_100_000), amount(207_100_000, ceil=True), amount(1_500_000_000), amount(20_349_000_000)
-    ('207 MB', '208 MB', '1.5 GB', '20.34 GB')
+    >>> [format_bytes(size) for size in (207_100_000, 1_500_000_000, 20_349_000_000)]
+    ['207 MB', '1.5 GB', '20.34 GB']
+    >>> format_bytes(207_100_000, ceil=True)
+    '208 MB'
     """
     rounded = math.ceil if ceil else math.floor
     if (megabytes := rounded(size / 1e6)) < 1000:
@@ -99,21 +101,21 @@ def amount(size: float, *, ceil: bool = False) -> str:
     return f"{rounded(size / 1e7) / 100:g} GB"
 
 
-def _rounded_down(value: float) -> int:
+def _round_down(value: float) -> int:
     """Round down to two digits."""
     step = 10 ** max(0, len(str(int(max(0, value)))) - 2)
     return int(max(0, value) // step * step)
 
 
-def _limit_text(tiling: Tiling) -> str:
-    size = amount(tiling.usable_memory)
+def _describe_limit(tiling: Tiling) -> str:
+    size = format_bytes(tiling.usable_memory)
     return f"--memory {size}" if tiling.memory else f"the {size} used of the machine's memory"
 
 
-def bytes_of(text: str) -> int:
+def parse_bytes(text: str) -> int:
     """Parse a size such as 4GB, 500MB or 2GiB; units are powers of 1000, with an i of 1024.
 
-    >>> bytes_of("4GB"), bytes_of("1.5 gib")
+    >>> parse_bytes("4GB"), parse_bytes("1.5 gib")
     (4000000000, 1610612736)
     """
     match = _MEMORY_SIZE.fullmatch(text.strip())
@@ -141,8 +143,8 @@ def check_whole_memory(source: Source, tiling: Tiling, times: float, tile_times:
     if need > tiling.memory:
         tiles = TileMemory(stream.count, row_bytes, tile_times, None if source.store is None else source.path)
         raise InputError(
-            f"{stream.count:,} Gaussians in one piece take about {amount(need, ceil=True)}, "
-            f"{amount(_TASK_BYTES)} of it the program, more than {_limit_text(tiling)}; "
+            f"{stream.count:,} Gaussians in one piece take about {format_bytes(need, ceil=True)}, "
+            f"{format_bytes(_TASK_BYTES)} of it the program, more than {_describe_limit(tiling)}; "
             f"{tiles.advice(tiling.memory, max(1, stream.count // 2))}",
             path=source.path,
         )
@@ -177,15 +179,20 @@ def plan_tiles(scene: TileStore | SceneStream | PointStream, tiling: Tiling, tim
     """
     from g2ard.tiles.writer import expected_tiles
 
-    memory, count, folder = tiling.usable_memory, scene.count, None
+    memory = tiling.usable_memory
+    count = scene.count
+    folder = None
     if isinstance(scene, TileStore):
-        number, most = len(scene.tiles), scene.settings.get("tile_rows")
+        number = len(scene.tiles)
+        most = scene.settings.get("tile_rows")
         largest = max(scene.tiles, key=lambda tile: tile.rows + tile.halo)
-        rows, halo = int(largest.rows), int(largest.halo)
+        rows = int(largest.rows)
+        halo = int(largest.halo)
         folder = None if scene.folder.parent == tiling.folder else scene.folder
     else:
         times = max(times, _LIFTING_TIMES) if isinstance(scene, PointStream) else times
-        number, most = expected_tiles(count, tiling.most_rows), tiling.most_rows
+        number = expected_tiles(count, tiling.most_rows)
+        most = tiling.most_rows
         rows = -(-count // number)
         halo = round((_HALO_TIMES - 1) * rows)
     row_bytes = 4 * row_width(0 if isinstance(scene, PointStream) else scene.sh_degree)
@@ -197,13 +204,13 @@ def plan_tiles(scene: TileStore | SceneStream | PointStream, tiling: Tiling, tim
     if fit < 1:
         raise InputError(
             f"a tile of {rows:,} Gaussians and {halo:,} around it takes about "
-            f"{amount(need, ceil=True)}, {amount(_TASK_BYTES)} of it the program, more than "
-            f"{_limit_text(tiling)}; {tiles.advice(memory, most or rows)}"
+            f"{format_bytes(need, ceil=True)}, {format_bytes(_TASK_BYTES)} of it the program, more than "
+            f"{_describe_limit(tiling)}; {tiles.advice(memory, most or rows)}"
         )
     if tiling.workers is not None and tiling.scheduler is None and tiling.workers > fit:
         raise InputError(
-            f"--workers {tiling.workers} take about {amount(tiling.workers * need, ceil=True)}, more than "
-            f"{_limit_text(tiling)}; --workers {fit} fit"
+            f"--workers {tiling.workers} take about {format_bytes(tiling.workers * need, ceil=True)}, more "
+            f"than {_describe_limit(tiling)}; --workers {fit} fit"
         )
     workers = tiling.workers or max(1, min(fit, tiling.usable_cores))
     return TilePlan(

@@ -19,9 +19,9 @@ from g2ard.io import Source
 from g2ard.io.images import png_bytes, resize
 from g2ard.io.photos import load_photo
 from g2ard.io.reports import Report
-from g2ard.jobs.comparison import made_of_points
+from g2ard.jobs.comparison import is_made_of_points
 from g2ard.jobs.inputs import GivenViews, Views, load_scene
-from g2ard.jobs.viewer_frame import backdrop, frame_of
+from g2ard.jobs.viewer_frame import choose_backdrop, choose_frame
 from g2ard.poses import best_views
 from g2ard.progress import Progress, Say, kernel, silent, unsaid
 from g2ard.rendering.renderer import Renderer
@@ -98,69 +98,74 @@ def view(
     ]
     beside = shown[0].file if isinstance(shown[0], Source) else None
     labels = label_scenes(named, [len(splats) for splats in loaded])
-    stand = frame_of(loaded[0], GivenViews(views, beside, up), start=start, say=say)
+    stand = choose_frame(loaded[0], GivenViews(views, beside, up), start=start, say=say)
     page = Path(mkdtemp(prefix="g2ard-")) / "view.html" if output is None else Path(output)
     write_page(
         page,
         [(label, stand.of(splats)) for label, splats in zip(labels, loaded, strict=True)],
         start=stand.start,
-        background=backdrop(background, loaded, of_points=beside is not None and made_of_points(beside)),
+        background=choose_backdrop(
+            background, loaded, of_points=beside is not None and is_made_of_points(beside)
+        ),
         overwrite=overwrite,
         progress=progress,
     )
-    return _inline(page, loaded[0]) if kernel() is not None else page
+    return _embed_page(page, loaded[0]) if kernel() is not None else page
 
 
-def html_of(shown: Any) -> str:
+def write_html(shown: Any) -> str:
     """Return what a notebook shows: a line, and of a report its values, otherwise a picture."""
     try:
-        picture = _picture(shown)
+        picture = _draw_picture(shown)
     except InputError as error:  # nothing visible, or a photo that moved
         return f"<div>{escape(repr(shown))}<br><small>{escape(str(error))}</small></div>"
     return f"<div>{escape(repr(shown))}<br>{picture}</div>"
 
 
-def _picture(shown: Any) -> str:
+def _draw_picture(shown: Any) -> str:
     if isinstance(shown, Report):
         rows = (f"<tr><td>{name}</td><td>{escape(text)}</td></tr>" for name, text in shown.rows())
         return f"<table>{''.join(rows)}</table>"
     if isinstance(shown, Camera):
         if shown.image_path is None:
-            return _wedge(shown)
-        return _embedded(_small(load_photo(Cameras.of([shown]), 0)[0]))
+            return _draw_wedge(shown)
+        return _embed(_shrink(load_photo(Cameras.of([shown]), 0)[0]))
     if isinstance(shown, Cameras):
-        return " ".join(_picture(shown[int(view)]) for view in evenly_spaced(len(shown), _TARGETS))
+        return " ".join(_draw_picture(shown[int(view)]) for view in evenly_spaced(len(shown), _TARGETS))
     held = getattr(shown, "splats", None)
     if held is None and hasattr(shown, "cameras"):
-        return _embedded(_row(shown))
+        return _embed(_draw_row(shown))
     scene = scene_of(held[0] if isinstance(held, tuple) else shown)  # the finest of levels
     view = best_views(scene, size=_SIZE)[0]
     drawn = Renderer(scene).render(view)
-    lifted = backdrop(None, [scene]) is None
-    return _embedded(seen_on_sky(drawn) if lifted else np.clip(drawn.image, 0, 1))
+    lifted = choose_backdrop(None, [scene]) is None
+    return _embed(seen_on_sky(drawn) if lifted else np.clip(drawn.image, 0, 1))
 
 
-def _row(targets: Targets) -> NDArray[np.uint8]:
+def _draw_row(targets: Targets) -> NDArray[np.uint8]:
     """Return a few targets in a row, evenly spaced."""
     some = evenly_spaced(len(targets.cameras), _TARGETS)
     names = [targets.cameras.names[view] for view in some]
-    return draw_contact_sheet([[_small(targets[int(view)]) for view in some]], names)
+    return draw_contact_sheet([[_shrink(targets[int(view)]) for view in some]], names)
 
 
-def _small(image: NDArray[Any]) -> NDArray[Any]:
+def _shrink(image: NDArray[Any]) -> NDArray[Any]:
     height, width = image.shape[:2]
     share = min(1.0, _TARGET / max(height, width))
     return resize(image, (max(1, round(width * share)), max(1, round(height * share))))
 
 
-def _embedded(image: NDArray[Any]) -> str:
+def _embed(image: NDArray[Any]) -> str:
     return f'<img alt="" src="data:image/png;base64,{base64.b64encode(png_bytes(image)).decode()}">'
 
 
-def _wedge(camera: Camera) -> str:
+def _draw_wedge(camera: Camera) -> str:
     """Draw the image's frame and its principal point, in proportion."""
-    width, height = camera.width, camera.height
-    x, y, line = camera.K[0, 2], camera.K[1, 2], max(width, height) / 100
+    width = camera.width
+    height = camera.height
+    x = camera.K[0, 2]
+    y = camera.K[1, 2]
+    line = max(width, height) / 100
     return (
         f'<svg viewBox="0 0 {width} {height}" width="{_TARGET}" fill="none" stroke="currentColor"'
         f' stroke-width="{line:g}"><rect width="{width}" height="{height}"/>'
@@ -168,13 +173,13 @@ def _wedge(camera: Camera) -> str:
     )
 
 
-def _inline(page: Path, scene: Splats) -> Any:
+def _embed_page(page: Path, scene: Splats) -> Any:
     from IPython.display import HTML, IFrame
 
     size = page.stat().st_size
     if size > _LARGEST:
         text = f"{page}: {size / 1e6:.1f} MB are too many to embed; open it in a browser"
-        return HTML(f"<div>{escape(text)}<br>{_picture(scene)}</div>")
+        return HTML(f"<div>{escape(text)}<br>{_draw_picture(scene)}</div>")
     print(f"{page.name}: {size / 1e6:.1f} MB are embedded in this notebook")
     content = escape(page.read_text(encoding="utf-8"))
     return IFrame("about:blank", "100%", _FRAME, extras=[f'srcdoc="{content}"'])

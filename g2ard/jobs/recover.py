@@ -13,12 +13,12 @@ from numpy.typing import ArrayLike, NDArray
 from g2ard.config.checks import AtLeastOne, checks_arguments
 from g2ard.config.choices import Colour, RenderModel
 from g2ard.config.schema import changed, full_paths, keywords
-from g2ard.errors import InputError, require
+from g2ard.errors import InputError
 from g2ard.jobs.cost import Cost, cost_of_recovery
 from g2ard.jobs.inputs import GivenViews, Views, load_scene
-from g2ard.jobs.run_views import views_or_pool
+from g2ard.jobs.run_views import find_or_plan_views
 from g2ard.jobs.teaching import RunTargets, Teaching, check_teacher, read_views
-from g2ard.pipeline.presets import PRESETS, configured
+from g2ard.pipeline.presets import PRESETS, configure
 from g2ard.progress import Detail, Progress, Say, plural, silent, unsaid
 from g2ard.rendering.targets import RENDERS, Exposed, Targets, checked_targets, fill, kinds_of
 from g2ard.report.run import KindScore, summarize_by_kind
@@ -54,9 +54,11 @@ class RecoverJob:
 
     def run(self, checkpoint: Path | None = None, watch: Watch | None = None) -> Recovered:
         """Recover the student; see `g2ard.recover`."""
-        built, in_plane, train = self.anchors, self.config.regularizers.in_plane, self.targets.train
+        built = self.anchors
+        in_plane = self.config.regularizers.in_plane
+        train = self.targets.train
         if not self._same:
-            for targets in filter(None, (train, self.validation)):
+            for targets in filter(None, (train, self.targets.validation)):
                 fill(targets, self.progress)
         return optimize(
             self.student,
@@ -64,7 +66,7 @@ class RecoverJob:
             self.config,
             weights=self.weights,
             anchors=None if built is None else Anchors.of(built, in_plane),
-            validation=self.validation,
+            validation=self.targets.validation,
             checkpoint=checkpoint,
             progress=self.progress,
             watch=watch,
@@ -80,24 +82,14 @@ class RecoverJob:
     def cost(self) -> Cost:
         """Rough memory."""
         steps: int | None = self.config.horizon if self.config.recovery_time is None else None
-        return cost_of_recovery(
-            self.student,
-            self.targets.train.cameras,
-            0 if self._same else steps,
-            scored=None if self.held_out is None else self.held_out.cameras,
-            validation=None if self.validation is None else self.validation.cameras,
-            teacher=self.teacher,
-        )
+        views = self.targets.views
+        used = [views.train.cameras, *views.untrained]
+        return cost_of_recovery(self.student, used, 0 if self._same else steps, self.teacher)
 
     @property
     def held_out(self) -> Targets | None:
         """Held-out targets for scoring; None without such views."""
         return self.targets.held_out if len(self.targets.views.test) else None
-
-    @property
-    def validation(self) -> Targets | None:
-        """Renders of views of other kinds that limit changes; None without."""
-        return self.targets.validation if self.config.schedule.guarded else None
 
     def score(self, result: Recovered) -> tuple[KindScore, ...]:
         """Score student and result in held-out views, by kind of view; empty without such views."""
@@ -231,7 +223,7 @@ def recover(
     config = changed(config, full_paths(named, config))
     start = load_scene(student, say, render_model).narrowed()
     if not isinstance(anchors, Anchors | None):
-        anchors = Anchors.of(_built(anchors, start, render_model, say), config.regularizers.in_plane)
+        anchors = Anchors.of(_load_anchors(anchors, start, render_model, say), config.regularizers.in_plane)
     return optimize(
         start,
         targets,
@@ -276,40 +268,42 @@ def prepare(
     """
     check_teacher(views, teacher)
     given = full_paths(settings or {}, RecoverConfig())
-    require("preset", repr(preset), preset in PRESETS, f"one of {', '.join(PRESETS)}")
+    config = configure(RecoverConfig(), preset, given)
     named = {**PRESETS[preset], **given}
-    config = configured(RecoverConfig(), preset, given)
     start = load_scene(student, say, render_model).narrowed()
     dense = None if teacher is None else load_scene(teacher, say, render_model)
     teaching = Teaching.by(
         dense,
         config.background,
         chosen="recover.background" in given,
-        photos=photos,
+        insisted=photos,
         rough=rough,
         say=say,
     )
     if dense is not None:
         beside = None if isinstance(teacher, Splats) else teacher
         asked = GivenViews(views, beside, seed=config.seed, rough=rough)
-        views = views_or_pool(dense, asked, student=start, progress=progress, say=say)
+        views = find_or_plan_views(dense, asked, student=start, progress=progress, say=say)
     assert views is not None  # `check_teacher`
-    targets = RunTargets.of(teaching, read_views(teaching, start, views, split, size))
-    chosen = targets.views.train
+    read = read_views(teaching, start, views, split, size)
+    if not config.schedule.guarded:
+        read = replace(read, validation=None)
+    targets = RunTargets.of(teaching, read)
+    chosen = read.train
     of_split = "training view" if split == "train" else f"{split} view"
     say(f"{plural(len(chosen.cameras), of_split)} against {kinds_of(targets.train)}")
     weighted = named.get("select.weighted", True) if weighted is None else weighted
     weights = chosen.weights if weighted else None
     if weights is not None:
         say(f"sampling {plural(len(weights), 'view')} by weight")
-    built = None if anchors is None else _built(anchors, start, render_model, say)
+    built = None if anchors is None else _load_anchors(anchors, start, render_model, say)
     regularizers, why, measures = choose_regularizers(
         named.get("recover.regularizers"),
         dense or built or start,
         None if dense or rough else chosen.cameras,
         paper=named.get("recover.schedule") == "paper",
     )
-    config = configured(RecoverConfig(), preset, {**given, "recover.regularizers": regularizers})
+    config = configure(RecoverConfig(), preset, {**given, "recover.regularizers": regularizers})
     if config.recovery_time is None:
         of_photos = kinds_of(targets.train) != RENDERS
         config = replace(config, steps=config.final_steps(start, chosen.cameras, of_photos=of_photos))
@@ -318,7 +312,7 @@ def prepare(
     return RecoverJob(start, dense, targets, config, weights, built, why, measures, progress)
 
 
-def _built(
+def _load_anchors(
     anchors: Splats | str | Path, student: Splats, render_model: RenderModel | None, say: Say
 ) -> Splats:
     """Return the student as it was built, in its present coordinates."""

@@ -23,7 +23,7 @@ from g2ard.io.signs import explained
 from g2ard.jobs.inputs import load_scene
 from g2ard.jobs.trajectory import is_trajectory, read_ace, read_trajectory
 from g2ard.jobs.view_checks import propose_background
-from g2ard.pipeline.presets import configured
+from g2ard.pipeline.presets import configure
 from g2ard.poses import plan_pool
 from g2ard.progress import Progress, Say, plural, silent, unsaid
 from g2ard.scene.cameras import Camera, Cameras
@@ -78,8 +78,9 @@ def prepare(
     say: Say = unsaid,
 ) -> RegisterJob:
     """Read the inputs of `register`, whose arguments these are, and decide everything."""
-    config = configured(config or RegisterConfig(), settings=settings)
-    taken, posed = photos, True
+    config = configure(config or RegisterConfig(), settings=settings)
+    taken = photos
+    posed = True
     if isinstance(taken, Cameras):
         stated = {"intrinsics": intrinsics, "focal": focal, "split": split, "alpha": alpha}
         for name, value in stated.items():
@@ -285,7 +286,8 @@ def _check_aspects(files: list[Path], sizes: list[tuple[int, int]], views: list[
     """Reject intrinsics that fit none of the photos; single misfits are rejected later."""
     wanted = [(view.width, view.height) for view in views]
     if any(sizes[0]) and not any(map(_suits, files, sizes, wanted)):
-        (w, h), view = sizes[0], views[0]
+        (w, h) = sizes[0]
+        view = views[0]
         raise InputError(
             f"the photo is {w}×{h}, but its intrinsics are for {view.width}×{view.height}; "
             "pass intrinsics with the aspect ratio of these photos",
@@ -331,7 +333,8 @@ def matched(found: Mapping[str, Found], names: Sequence[str]) -> dict[str, Found
     """
     out = {name: found[name] for name in names if name in found}
     for shortened in (_flat, _stem):
-        theirs, ours = Counter(map(shortened, found)), Counter(map(shortened, names))
+        theirs = Counter(map(shortened, found))
+        ours = Counter(map(shortened, names))
         known = {shortened(name): value for name, value in found.items() if theirs[shortened(name)] == 1}
         for name in names:
             if name not in out and shortened(name) in known and ours[shortened(name)] == 1:

@@ -24,11 +24,11 @@ from g2ard.jobs.inputs import (
     load_views,
     split_views,
 )
-from g2ard.jobs.view_checks import as_pool, check_sight, given_or_found, warn_of_sight
-from g2ard.jobs.viewer_frame import level_up
+from g2ard.jobs.view_checks import check_sight, size_like_pool, take_or_find_views, warn_of_sight
+from g2ard.jobs.viewer_frame import find_shared_up
 from g2ard.pipeline.config import SelectConfig
 from g2ard.pipeline.dense import Dense, InMemory
-from g2ard.pipeline.distill import RunViews, draw_weights
+from g2ard.pipeline.distill import RunViews, choose_draw_weights
 from g2ard.poses import Pool, best_views, plan_pool, turntable
 from g2ard.poses.zooms import zoomed
 from g2ard.progress import Progress, Say, direction, plural, silent, unsaid
@@ -101,7 +101,7 @@ _WEIGHT_OTHERS = {"near": 8, "anywhere": 16}
 """Views of other kinds beside these: usual ones may all stand outside a closed room (decision 0040)."""
 
 
-def views_of(
+def choose_views(
     dense: Dense,
     options: DistillOptions,
     count: int,
@@ -134,11 +134,11 @@ def views_of(
     prior = dense.sample
     wanted = ["train"] if options.held_out is not None else ["train", "test"]
     asked = GivenViews(options.views, beside, options.up, options.config.recover.seed, rough=rough)
-    found, are_found = given_or_found(asked, prior, wanted, say)
-    plan = partial(_planned, dense, asked, progress=progress)
+    found, are_found = take_or_find_views(asked, prior, wanted, say)
+    plan = partial(_plan_views, dense, asked, progress=progress)
     select = replace(options.config.select, focus=options.focus)
     mix = partial(
-        _mixed,
+        _add_other_kinds,
         dense=dense,
         count=count,
         size=options.size,
@@ -157,8 +157,8 @@ def views_of(
         planned = plan(_POOL_VIEWS, grow=_POOL_GROWTH)
         share = 1.0
         if use != "merging":
-            share = pool_share(options.config.recover, prior, planned.cameras)
-        views = _generated(
+            share = choose_pool_share(options.config.recover, prior, planned.cameras)
+        views = _split_pool(
             planned,
             held_out,
             options.size,
@@ -174,17 +174,20 @@ def views_of(
         )
         if use == "merging" or options.config.simplify.method == "paper":
             return views
-        merging = cameras_for_weights(dense, asked, progress=progress)
+        merging = choose_weighing_views(dense, asked, progress=progress)
         return replace(views, merging=merging)
     train, test = given or split_views(found, options.held_out, say, unpictured=teach)
     if not are_found:
         check_sight(prior, train.cameras, say)
     else:
-        train, test = replace(train, cameras=as_pool(train.cameras)), as_pool(test)
-    full = shrunk(test, options.size)
+        train = replace(train, cameras=size_like_pool(train.cameras))
+        test = size_like_pool(test)
+    full = keep_larger(test, options.size)
     if options.size is not None and options.photos is False:  # photos that are not read do not limit it
-        train, test = replace(train, cameras=train.cameras.scaled(options.size)), test.scaled(options.size)
-    train, test = train.fitted(options.size), test.fitted(options.size)
+        train = replace(train, cameras=train.cameras.scaled(options.size))
+        test = test.scaled(options.size)
+    train = train.fitted(options.size)
+    test = test.fitted(options.size)
     if not teach or any(train.cameras.image_paths):
         if options.config.select.focus:
             say("warning: --focus has no effect on views with photos")
@@ -195,9 +198,9 @@ def views_of(
         planned = plan(_OFFERED_VIEWS)
     except InputError:  # the scene has no room for poses
         return RunViews(train, test, full=full)
-    weigh = partial(draw_weights, prior, train, options.config, progress)
-    train, others, _ = mix(train, planned, select=select, weigh=weigh, zoom=False)
-    return RunViews(train, test, *_halved(others), full=full)
+    weigh = partial(choose_draw_weights, prior, train, options.config, progress)
+    train, others, _ = mix(train, planned, select=select, weigh=weigh)
+    return RunViews(train, test, *_halve_others(others), full=full)
 
 
 def is_untouched(recover: RecoverConfig, prior: Splats, count: int, total: int) -> bool:
@@ -206,7 +209,7 @@ def is_untouched(recover: RecoverConfig, prior: Splats, count: int, total: int) 
     return count == total and (degree is None or degree >= prior.sh_degree) and recover.schedule.guarded
 
 
-def pool_share(recover: RecoverConfig, scene: Splats, pool: Cameras) -> float:
+def choose_pool_share(recover: RecoverConfig, scene: Splats, pool: Cameras) -> float:
     """Return the share of a generated pool that a recovery of a scene uses."""
     schedule = recover.schedule
     if not schedule.means_in_scales:
@@ -218,19 +221,19 @@ def pool_share(recover: RecoverConfig, scene: Splats, pool: Cameras) -> float:
     return min(1.0, max(_LEAST_SHARE, (steps / _POOL_STEPS) ** _POOL_POWER))
 
 
-def shrunk(cameras: Cameras, size: int | None) -> Cameras | None:
+def keep_larger(cameras: Cameras, size: int | None) -> Cameras | None:
     """Return the views if `size` shrinks any of them, otherwise None."""
-    larger = size is not None and bool((np.maximum(cameras.widths, cameras.heights) > size).any())
+    larger = size is not None and bool((cameras.sides > size).any())
     return cameras if larger else None
 
 
-def within_pixels(cameras: Cameras) -> Cameras:
+def limit_pixels(cameras: Cameras) -> Cameras:
     """Return as many of the views as `FULL_PIXELS` hold, evenly spaced."""
-    largest = int((cameras.widths * cameras.heights).max())
+    largest = int(cameras.pixels.max())
     return take_evenly(cameras, max(1, FULL_PIXELS // largest))
 
 
-def _generated(
+def _split_pool(
     planned: Pool,
     held_out: Cameras | None,
     size: int | None,
@@ -247,28 +250,30 @@ def _generated(
     """
     names = planned.cameras.names
     held_back = split_mask(None, names, "test") if held_out is None else np.zeros(len(names), bool)
-    usual = spread_prefix(planned.cameras.take(~held_back), share)
-    test = spread_prefix(planned.cameras.take(held_back), share, _LEAST_SCORED)
+    usual = take_spread_prefix(planned.cameras.take(~held_back), share)
+    test = take_spread_prefix(planned.cameras.take(held_back), share, _LEAST_SCORED)
     train, others, unseen = mix(ViewSet(usual, splits=("train",) * len(usual)), planned)
     pool = ViewSet(
         Cameras.of([*train.cameras, *test]),
         splits=("train",) * len(train.cameras) + ("test",) * len(test),
     ).fitted(size)  # runs are compared in the views that they write
-    counts = _uses(use, len(train.cameras), len(test if held_out is None else held_out), len(others or ()))
-    say(f"views: {counts}; {_of(planned, pool.cameras)}")
-    train, scored = train.fitted(size), test
+    scored = test if held_out is None else held_out
+    counts = _count_uses(use, len(train.cameras), len(scored), len(others or ()))
+    say(f"views: {counts}; {_describe_kinds(planned, pool.cameras)}")
+    train = train.fitted(size)
     if held_out is not None:
-        train, scored = drop_held_out(train, held_out, say), held_out
-    full, scored = shrunk(scored, size), scored.fitted(size)
+        train = drop_held_out(train, held_out, say)
+    full = keep_larger(scored, size)
+    scored = scored.fitted(size)
     twice = None
     if use == "distil" and held_out is None:
-        twice = _twice(scored, max(2, round(share * _TWICE_VIEWS)))
-    validation, apart = _halved(others and others.fitted(size))
+        twice = _double_size(scored, max(2, round(share * _TWICE_VIEWS)))
+    validation, apart = _halve_others(others)
     guess = planned.why.rpartition("; ")[2] if "guess" in planned.why else None
     return RunViews(train, scored, validation, apart, pool, unseen, full, twice, guess)
 
 
-def _halved(others: Cameras | None) -> tuple[Cameras | None, Cameras | None]:
+def _halve_others(others: Cameras | None) -> tuple[Cameras | None, Cameras | None]:
     """Return every second one of further views of other kinds, which validate, and the rest for scoring."""
     if others is None or len(others) < 2:
         return None, None
@@ -276,31 +281,34 @@ def _halved(others: Cameras | None) -> tuple[Cameras | None, Cameras | None]:
     return validation, apart
 
 
-def _twice(cameras: Cameras, count: int) -> Cameras | None:
+def _double_size(cameras: Cameras, count: int) -> Cameras | None:
     """Return some views at twice their size, None if that is very large."""
-    longest = 2 * int(np.maximum(cameras.widths, cameras.heights).max())
+    longest = 2 * int(cameras.sides.max())
+    if longest > _TWICE_LONGEST:
+        return None
     some = take_evenly(cameras, count).scaled(longest)
-    return replace(some, kinds=(_TWICE,) * len(some)) if longest <= _TWICE_LONGEST else None
+    return replace(some, kinds=(_TWICE,) * len(some))
 
 
-def spread_prefix(cameras: Cameras, share: float, least: int = 1) -> Cameras:
+def take_spread_prefix(cameras: Cameras, share: float, least: int = 1) -> Cameras:
     """Return a share of the views, each next one farthest from those before; fewer are a prefix of more."""
     wanted = max(least, round(share * len(cameras)))
     if wanted >= len(cameras):
         return cameras
     spread = max(float(np.ptp(cameras.positions, axis=0).max()), np.finfo(float).tiny)
     places = np.concatenate([cameras.positions / spread, cameras.forwards / 4], axis=1)
-    apart, order = np.full(len(places), np.inf), [0]
+    apart = np.full(len(places), np.inf)
+    order = [0]
     while len(order) < wanted:
         apart = np.minimum(apart, np.square(places - places[order[-1]]).sum(axis=1))
         order.append(int(np.argmax(apart)))
     return cameras.take(sorted(order))
 
 
-def _uses(use: Use, train: int, test: int, apart: int) -> str:
+def _count_uses(use: Use, train: int, test: int, apart: int) -> str:
     """Count views by use.
 
-    >>> _uses("distil", 112, 16, 48), _uses("merging", 112, 16, 48)
+    >>> _count_uses("distil", 112, 16, 48), _count_uses("merging", 112, 16, 48)
     ('112 train, 40 score, 24 validate', '112 measure visibility, 16 score')
     """
     if use == "merging":
@@ -318,7 +326,7 @@ _Mixed = tuple[ViewSet, Cameras | None, float | None]
 """Training views, further views of other kinds, and the unseen share of the scene if it was measured."""
 
 
-def _mixed(
+def _add_other_kinds(
     train: ViewSet,
     planned: Pool,
     *,
@@ -330,8 +338,7 @@ def _mixed(
     say: Say,
     share: float = 1.0,
     learns: bool = True,
-    weigh: Callable[[], NDArray[np.float64] | None] = lambda: None,
-    zoom: bool = True,
+    weigh: Callable[[], NDArray[np.float64] | None] | None = None,
     rough: bool = False,
 ) -> _Mixed:
     """Add views of other kinds to training views: those that `complete` chooses, or of one kind with a focus.
@@ -341,13 +348,15 @@ def _mixed(
     Args:
         share: share of the pool that is used.
         learns: whether a scene is recovered in the views; otherwise no views are added.
-        weigh: returns the weights of training views; None draws them equally often, as planned ones, which
-            are not crowded. The others are drawn as often as these on average.
-        zoom: whether some of the training views become zooms.
+        weigh: of given views, returns the weights with which they are drawn, or None if equally often. The
+            others are drawn as often as these on average. None for planned views, which are not crowded;
+            some of these become zooms.
         rough: whether to add as many views as usual instead of choosing them.
     """
-    usual, times = len(train.cameras), pool_times(dense.total)
-    spare, focus = max(_LEAST_APART, round(_VIEWS_APART * times * share)), select.focus
+    usual = len(train.cameras)
+    times = find_pool_growth(dense.total)
+    spare = max(_LEAST_APART, round(_VIEWS_APART * times * share))
+    focus = select.focus
     least = round(_TRAINING_VIEWS * times * share)
     grown = max(1.0, min(usual / (_TRAINING_VIEWS * share), _POOL_GROWTH * times))
     usual_most = round(_OFFERED_VIEWS * grown * share)
@@ -361,33 +370,36 @@ def _mixed(
     for kind, most in wanted.items():
         cameras = planned.more(kind, usual_most + spare)
         taken = min(usual_most, max(len(cameras) - spare, len(cameras) // 2))
-        learned, scored = cameras[:taken][:most], cameras[taken:]  # scored alike with and without a focus
+        learned = cameras[:taken][:most]
+        scored = cameras[taken:]  # scored alike with and without a focus
         if len(learned) < most:
-            learned += _elsewhere(planned.more(kind, most + spare), cameras)[: most - len(learned)]
+            learned += _drop_same_places(planned.more(kind, most + spare), cameras)[: most - len(learned)]
         if kind == focus and len(learned) < 0.9 * most:
             room = f"room for {len(learned)} such views, {most} are wanted"
             say(f"warning: --focus {kind}: the scene has {room}")
         offered += learned
         apart += scored
     others = Cameras.of(apart).fitted(size) if apart else None
-    more, unseen = Cameras.of(offered) if offered and learns else None, None
-    if focus is None and more is not None and rough:
-        more = take_evenly(more, round(_USUAL_OTHERS * usual))
-    elif focus is None and more is not None:
-        compact, per_row = _compact(dense, count, progress)
-        order, _, unseen = complete(
-            compact,
-            train.cameras,
-            more,
-            max(usual, least),
-            least_views=least,
-            represents=per_row,
-            progress=progress,
-        )
-        more = more.take(order) if len(order) else None
+    more = Cameras.of(offered) if offered and learns else None
+    unseen = None
+    if focus is None and more is not None:
+        if rough:
+            more = take_evenly(more, round(_USUAL_OTHERS * usual))
+        else:
+            compact, per_row = _merge_roughly(dense, count, progress)
+            order, _, unseen = complete(
+                compact,
+                train.cameras,
+                more,
+                max(usual, least),
+                least_views=least,
+                represents=per_row,
+                progress=progress,
+            )
+            more = more.take(order) if len(order) else None
     if more is None:
         return train, others, unseen
-    own = None if rough else weigh()
+    own = None if rough or weigh is None else weigh()
     weights = np.ones(usual) if own is None else own / own.mean()
     mixed = ViewSet(
         Cameras.of([*train.cameras, *more]).fitted(size),
@@ -395,19 +407,19 @@ def _mixed(
         train.splits and train.splits + ("train",) * len(more),
         np.append(weights, np.ones(len(more))),
     )
-    if focus is None and zoom and not rough:
+    if focus is None and weigh is None and not rough:
         mixed = replace(mixed, cameras=zoomed(compact, mixed.cameras, represents=per_row, share=share))
     return mixed, others, unseen
 
 
-def _elsewhere(views: Sequence[Camera], others: Sequence[Camera]) -> list[Camera]:
+def _drop_same_places(views: Sequence[Camera], others: Sequence[Camera]) -> list[Camera]:
     """Return the views that stand where none of the others does, with names that these do not have."""
     places = np.array([view.position for view in others]).reshape(-1, 3)
     found = [view for view in views if not np.isclose(places, view.position).all(axis=1).any()]
     return [replace(view, name=f"{view.name} (more)") for view in found]
 
 
-def _compact(dense: Dense, count: int, progress: Progress) -> tuple[Splats, float]:
+def _merge_roughly(dense: Dense, count: int, progress: Progress) -> tuple[Splats, float]:
     """Return a scene like a dense one merged to `count`, and the Gaussians that a row stands for."""
     prior = dense.sample
     rows = min(count, _COMPACT_ROWS, len(prior))
@@ -417,7 +429,7 @@ def _compact(dense: Dense, count: int, progress: Progress) -> tuple[Splats, floa
     return small, count / rows
 
 
-def views_or_pool(
+def find_or_plan_views(
     scene: Splats,
     given: GivenViews,
     *,
@@ -433,15 +445,15 @@ def views_or_pool(
         student: a compact scene that will be recovered in a generated pool. Views of other kinds complete it
             as in `distill`, and further ones are in the splits `test` and, for validation, `val`.
     """
-    found, _ = given_or_found(given, scene, [], say)
+    found, _ = take_or_find_views(given, scene, [], say)
     if found is not None:
         return found
     grow = _POOL_GROWTH if count is None else 1.0
     count = _POOL_VIEWS if count is None else count
-    planned = _planned(InMemory(scene), given, count, progress=progress, grow=grow)
+    planned = _plan_views(InMemory(scene), given, count, progress=progress, grow=grow)
     if student is not None:
         mix = partial(
-            _mixed,
+            _add_other_kinds,
             dense=InMemory(student),
             count=len(student),
             select=SelectConfig(),
@@ -450,22 +462,23 @@ def views_or_pool(
             progress=progress,
             say=say,
         )
-        made = _generated(planned, None, None, mix, "distil", say)
+        made = _split_pool(planned, None, None, mix, "distil", say)
         assert made.pool is not None
-        validation, apart = made.validation or (), made.apart or ()
+        validation = made.validation or ()
+        apart = made.apart or ()
         splits = (*made.pool.splits, *["val"] * len(validation), *["test"] * len(apart))
         return ViewSet(Cameras.of([*made.pool.cameras, *validation, *apart]), splits=splits)
-    say(f"views: {len(planned.cameras)} generated; {_of(planned, planned.cameras)}")
+    say(f"views: {len(planned.cameras)} generated; {_describe_kinds(planned, planned.cameras)}")
     return ViewSet(planned.cameras, splits=splits_of(None, planned.cameras.names))
 
 
-def planned_at(size: Sequence[int] | None) -> tuple[int, int]:
+def choose_plan_size(size: Sequence[int] | None) -> tuple[int, int]:
     """Return the size to plan views at for a requested one, a longer side or width and height.
 
     It has the requested shape, but not its pixels, so that the same views are planned at any size.
 
-    >>> planned_at(None), planned_at([1920]), planned_at([1920, 1080]), planned_at([600, 1200])
-    ((800, 600), (800, 600), (800, 450), (400, 800))
+    >>> [choose_plan_size(size) for size in (None, [1920], [1920, 1080], [600, 1200])]
+    [(800, 600), (800, 600), (800, 450), (400, 800)]
     """
     if size is None or len(size) == 1:
         return _SHAPE
@@ -473,8 +486,8 @@ def planned_at(size: Sequence[int] | None) -> tuple[int, int]:
     return width, height
 
 
-def at_size(cameras: Cameras, size: Sequence[int] | None, *, made: bool) -> Cameras:
-    """Return views at a requested size, see `planned_at`; those that were not `made` keep their shape."""
+def resize_views(cameras: Cameras, size: Sequence[int] | None, *, made: bool) -> Cameras:
+    """Return views at a requested size, see `choose_plan_size`; only `made` ones change their shape."""
     if size is None or len(size) == 1:
         return cameras.fitted(None if size is None else size[0])
     if not made:
@@ -483,11 +496,11 @@ def at_size(cameras: Cameras, size: Sequence[int] | None, *, made: bool) -> Came
 
 
 def is_planned(views: Views) -> bool:
-    """Return whether the views of `views_or_pool`, given as a path or none, were generated."""
+    """Return whether the views of `find_or_plan_views`, given as a path or none, were generated."""
     return isinstance(views, Cameras | ViewSet)
 
 
-def looks_at(
+def choose_looks(
     scene: Splats,
     count: int,
     given: GivenViews,
@@ -499,17 +512,17 @@ def looks_at(
 
     They are chosen from the cameras of photos found beside the scene, if there are any.
     """
-    photos = _photos_beside(scene, given, say)
+    photos = _find_photo_views(scene, given, say)
     best = best_views(scene, count, photos, size=given.shape, axis=given.up)
     if photos is None:
         say(f"views: {count} generated")
     if len(best) == count:
         return best
-    pool = _planned(InMemory(scene), given, count - len(best), progress=progress)
+    pool = _plan_views(InMemory(scene), given, count - len(best), progress=progress)
     return Cameras.of([*best, *pool.cameras])
 
 
-def _of(pool: Pool, cameras: Cameras) -> str:
+def _describe_kinds(pool: Pool, cameras: Cameras) -> str:
     """Describe the kinds of a pool, and of further views in it, briefly."""
     if pool.kind == _ROUGH:
         return _ROUGH
@@ -518,7 +531,7 @@ def _of(pool: Pool, cameras: Cameras) -> str:
     return f"{' + '.join(kinds)}{guess}"
 
 
-def cameras_for_weights(
+def choose_weighing_views(
     dense: Dense,
     given: GivenViews,
     *,
@@ -527,17 +540,17 @@ def cameras_for_weights(
 ) -> Cameras | None:
     """Choose views for simplification's visibility: given, found beside the scene, or generated.
 
-    Arguments are those of `views_of`; of `given` the training split is used. None means no views.
+    Arguments are those of `choose_views`; of `given` the training split is used. None means no views.
     """
-    found, are_found = given_or_found(given, dense.sample, ["train"], say)
+    found, are_found = take_or_find_views(given, dense.sample, ["train"], say)
     if found is not None:
         cameras = load_views(found, "train", None, say)
         if are_found:
-            return as_pool(cameras)
+            return size_like_pool(cameras)
         warn_of_sight(dense.sample, cameras, say)
         return cameras
     try:
-        pool = _planned(dense, given, _WEIGHT_VIEWS, rows=_WEIGHT_ROWS, progress=progress)
+        pool = _plan_views(dense, given, _WEIGHT_VIEWS, rows=_WEIGHT_ROWS, progress=progress)
         others = [camera for kind, count in _WEIGHT_OTHERS.items() for camera in pool.more(kind, count)]
         return Cameras.of([*pool.cameras, *others])
     except InputError as e:
@@ -545,20 +558,20 @@ def cameras_for_weights(
         return None
 
 
-def _planned(
+def _plan_views(
     dense: Dense, given: GivenViews, count: int, *, rows: int = _POOL_SAMPLE, **options: Any
 ) -> Pool:
     """Plan a pool as `plan_pool` does, but larger in proportion to a large scene's size."""
     prior = dense.sample
-    times = pool_times(dense.total)
+    times = find_pool_growth(dense.total)
     count = round(count * times)
     if given.rough:
-        return _rough_pool(prior, count, given.shape)
+        return _place_stand_ins(prior, count, given.shape)
     options |= {"size": given.shape, "up": given.up, "seed": given.seed}
     return plan_pool(prior, count, rows=round(rows * times), represents=dense.total / len(prior), **options)
 
 
-def _rough_pool(scene: Splats, count: int, size: tuple[int, int]) -> Pool:
+def _place_stand_ins(scene: Splats, count: int, size: tuple[int, int]) -> Pool:
     """Return stand-ins of a pool's views on a circle around the scene."""
     points = scene.means[evenly_spaced(len(scene), _ROUGH_ROWS)] + scene.offset
     middle = np.median(points, axis=0)
@@ -576,7 +589,7 @@ def _rough_pool(scene: Splats, count: int, size: tuple[int, int]) -> Pool:
     return Pool(Cameras.of(cameras("pose", count)), _ROUGH, "", np.array([0.0, 0.0, 1.0]), more=more)
 
 
-def pool_times(count: float) -> float:
+def find_pool_growth(count: float) -> float:
     """Return the growth factor of the pool for a scene of `count` Gaussians."""
     return max(1.0, count / _POOL_GAUSSIANS)
 
@@ -616,20 +629,20 @@ def orbit(
     >>> len(orbit(scene, 4, size=(64, 48)))
     4
     """
-    photos = _photos_beside(scene, GivenViews(None, beside, up, shape=size), say)
-    level = level_up(photos) if up is None and photos is not None else None
+    photos = _find_photo_views(scene, GivenViews(None, beside, up, shape=size), say)
+    level = find_shared_up(photos) if up is None and photos is not None else None
     views, axis = turntable(scene, count, photos, size=size, axis=up if level is None else level)
     if up is None:
         say(f"up: {direction(axis)}, estimated; --up X,Y,Z sets it")
     return views
 
 
-def _photos_beside(scene: Splats, given: GivenViews, say: Say) -> Cameras | None:
+def _find_photo_views(scene: Splats, given: GivenViews, say: Say) -> Cameras | None:
     """Return cameras at the poses of the photos of a run, or of those beside a scene, if there are any."""
     beside = given.beside
     found: Views | None = None if beside is None else run_views(beside)
     if found is None or found == Path(str(beside)):
-        found, _ = given_or_found(replace(given, views=None), scene, [], say)
+        found, _ = take_or_find_views(replace(given, views=None), scene, [], say)
     cameras = None if found is None else load_views(found, "all", None)
     if cameras is None or not any(cameras.image_paths):
         return None

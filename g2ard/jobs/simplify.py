@@ -18,19 +18,19 @@ from g2ard.io import Source
 from g2ard.io.scene_formats import check_positions, scene_format
 from g2ard.io.stream import PartsStream
 from g2ard.io.types import Note
-from g2ard.jobs.budget import Budget, count_of
+from g2ard.jobs.budget import Budget, parse_count
 from g2ard.jobs.budget_search import (
     Quality,
     ResolvedBudget,
-    as_file,
-    count_for_bytes,
-    count_for_layers,
-    count_for_quality,
+    find_count_for_bytes,
+    find_count_for_layers,
+    find_count_for_quality,
+    pass_through_file,
 )
 from g2ard.jobs.chosen_points import PointChoice
-from g2ard.jobs.inputs import GivenViews, Views, lifted_cloud, load_scene, say_regions
-from g2ard.pipeline.dense import Dense, InMemory, Merged, whole
-from g2ard.pipeline.presets import configured
+from g2ard.jobs.inputs import GivenViews, Views, lift_cloud, load_scene, say_regions
+from g2ard.pipeline.dense import Dense, InMemory, Merged, load_whole
+from g2ard.pipeline.presets import configure
 from g2ard.progress import Progress, Say, plural, silent, unsaid
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats
@@ -88,12 +88,10 @@ class Reduction:
             raise InputError("views and blind exclude each other")
         if self.given.views is not None and self.config.method == "paper":
             raise InputError("has no effect on the method paper", parameter="views")
-        weighed = self.cameras is not None or self.given.views is not None or self.config.method == "default"
-        weighed = weighed and not self.blind
         if isinstance(self.config, Pairs):
-            if self.config.pixel_scale != Pairs.pixel_scale and weighed:
+            if self.config.pixel_scale != Pairs.pixel_scale and self._is_weighed:
                 raise InputError("has no effect with views", parameter="simplify.pixel_scale")
-            if self.config.edge_weight != Pairs.edge_weight and not weighed:
+            if self.config.edge_weight != Pairs.edge_weight and not self._is_weighed:
                 raise InputError("has no effect without views", parameter="simplify.edge_weight")
             for name in ("edge_weight", "dilation") if self.splats.antialiased else ():
                 if getattr(self.config, name) != getattr(Pairs, name):
@@ -113,40 +111,49 @@ class Reduction:
         """Gaussians of the scene."""
         return self.dense.total
 
+    @property
+    def _is_viewed(self) -> bool:
+        """Whether the user or another job gave views."""
+        return self.cameras is not None or self.given.views is not None
+
+    @property
+    def _is_weighed(self) -> bool:
+        """Whether views weigh Gaussians by visibility, if there is room for them."""
+        return not self.blind and (self._is_viewed or self.config.method == "default")
+
     def __call__(self, count: int) -> Merged:
         if count not in self._merged:
             last = list(self._merged.items())[-1:]
             seen = self.seen if count < self.total else None
-            small = self.dense.merged(
+            small = self.dense.merge(
                 count, seen, self.config, gaps=not self.recovered, progress=self.progress
             )
-            self._merged = dict([*last, (count, small)])
+            self._merged = {**dict(last), count: small}
         return self._merged[count]
 
     @cached_property
     def seen(self) -> Cameras | None:
         """Views that weigh Gaussians by visibility."""
-        if self.blind or self.cameras is not None:
-            return None if self.blind else self.cameras
-        if self.config.method != "default" and self.given.views is None:
+        if not self._is_weighed:
             return None
-        from g2ard.jobs.run_views import cameras_for_weights  # loads planning, which others do not need
+        if self.cameras is not None:
+            return self.cameras
+        from g2ard.jobs.run_views import choose_weighing_views  # loads planning, which others do not need
 
-        return cameras_for_weights(self.dense, self.given, progress=self.progress, say=self.say)
+        return choose_weighing_views(self.dense, self.given, progress=self.progress, say=self.say)
 
     def warnings(self, small: Splats | PartsStream) -> list[str]:
         """Return warnings about the views, and about regions of a result that is in memory."""
         if not isinstance(small, Splats) or len(small) >= self.total:
             return []
-        from g2ard.jobs.doubts import doubts_of_merging, doubts_of_views  # as above
+        from g2ard.jobs.doubts import doubt_merging, doubt_views  # as above
 
-        told = doubts_of_merging(self.splats, small, blind=self.seen is None)
-        given = self.cameras is not None or self.given.views is not None
-        if self.seen is not None and given:
-            told += doubts_of_views(self.splats, self.seen)
+        told = doubt_merging(self.splats, small, blind=self.seen is None)
+        if self.seen is not None and self._is_viewed:
+            told += doubt_views(self.splats, self.seen)
         return told
 
-    def resolved(self, budget: Budget, name: str, file: str, sh_degree: int | None = None) -> ResolvedBudget:
+    def resolve(self, budget: Budget, name: str, file: str, sh_degree: int | None = None) -> ResolvedBudget:
         """Resolve a budget for the scene, called `name` in errors.
 
         If recovery follows, bytes are searched with the method `fast` and a margin. A rough job tries
@@ -156,34 +163,37 @@ class Reduction:
             file: a file name; its suffix is the format for `Budget.fit`.
             sh_degree: of the result; None is the scene's.
         """
-        splats, say, total = self.splats, self.say, self.total
+        splats = self.splats
+        say = self.say
+        total = self.total
         if self.given.rough and (budget.min_psnr is not None or budget.min_ssim is not None):
             say("the run measures how many Gaussians keep the quality; here, a tenth")
             return ResolvedBudget(max(1, total // 10))
         if budget.min_psnr is not None or budget.min_ssim is not None:
-            return self._resolved_for_quality(Quality(budget.min_psnr or 0.0, budget.min_ssim or 0.0), file)
+            return self._resolve_for_quality(Quality(budget.min_psnr or 0.0, budget.min_ssim or 0.0), file)
 
         def tried(count: int) -> Splats:
             if self.recovered and self.plan is None:
                 return merge(splats, count, method="fast").splats
-            return whole(self(count).splats)  # in tiles, recovery starts from this one
+            return load_whole(self(count).splats)  # in tiles, recovery starts from this one
 
         size = budget.bytes
         if size is not None and budget.of_page:
-            size, file = room_for_scene(size), "scene.sog"
+            size = room_for_scene(size)
+            file = "scene.sog"
         if size is not None:
             if sh_degree is not None:
                 splats = splats.with_sh_degree(sh_degree)
             exact = self.plan is not None and scene_format(file).suffix == ".ply"
             most = int(size * _BYTES_SAFETY) if self.recovered and not exact else size
             try_it = None if self.given.rough else tried
-            found = count_for_bytes(splats, most, file, try_it, None if self.plan is None else total)
+            found = find_count_for_bytes(splats, most, file, try_it, None if self.plan is None else total)
         else:
             found = budget.of(total, name)
             check_positions(file, splats, found)
         if budget.layers is not None and not self.given.rough:
             before = found
-            found, layers = count_for_layers(before, budget.layers, tried)
+            found, layers = find_count_for_layers(before, budget.layers, tried)
             if found < before:
                 say(
                     f"{budget.fit}: near views blend more than {budget.layers} Gaussians per pixel at "
@@ -195,7 +205,7 @@ class Reduction:
             say(f"{budget.fit}: {all_fit if found == total else fits}")
         return ResolvedBudget(found, size, file)
 
-    def _resolved_for_quality(self, wanted: Quality, file: str) -> ResolvedBudget:
+    def _resolve_for_quality(self, wanted: Quality, file: str) -> ResolvedBudget:
         """Find the count that keeps a quality in generated views, as read back from the format of `file`."""
         from g2ard.poses import plan_pool  # as above
 
@@ -211,13 +221,13 @@ class Reduction:
         cameras = pool.cameras.resized(_QUALITY_SIDE)
 
         def reduce(count: int) -> Splats:
-            small = as_file(whole(self(count).splats), file)
+            small = pass_through_file(load_whole(self(count).splats), file)
             self.progress("quality", 0, 0)
             return small
 
         drawn = self.dense.images(cameras)
         renders = [drawn[view] for view in range(len(cameras))]
-        found, near = count_for_quality(renders, self.total, wanted, cameras, reduce)
+        found, near = find_count_for_quality(renders, self.total, wanted, cameras, reduce)
         if found == self.total:
             self.say(f"no smaller count was found that keeps the quality; keeping all {found:,} Gaussians")
         else:
@@ -231,7 +241,7 @@ class Reduction:
         )
 
 
-def parents_of(small: Merged, source: Source) -> NDArray[np.int64]:
+def read_parents(small: Merged, source: Source) -> NDArray[np.int64]:
     """Return the (N,) new row of each row of a scene, in its file's order; −1 if it was dropped."""
     if isinstance(small, Simplified):
         return small.parents
@@ -242,7 +252,7 @@ def parents_of(small: Merged, source: Source) -> NDArray[np.int64]:
 
 
 @contextmanager
-def reducing(
+def open_reduction(
     scene: Splats | Source,
     tiling: Tiling | None = None,
     *,
@@ -268,19 +278,20 @@ def reducing(
         return
     given = replace(given, beside=given.beside or scene.path)
     if tiling is not None:
-        from g2ard.jobs.dense import opened
+        from g2ard.jobs.dense import open_tiles
 
-        with opened(scene, tiling, 1.0, options["config"], planned=planned, **callbacks) as tiles:
+        with open_tiles(scene, tiling, 1.0, options["config"], planned=planned, **callbacks) as tiles:
             counted(tiles.plan.count)
             options |= {"notes": tiles.notes, "plan": tiles.plan, **callbacks}
             yield Reduction(tiles.dense, given, **options)
         return
     progress("read", 0, 0)
     if scene.kind == "points":
-        splats = lifted_cloud(scene, progress, say)
+        splats = lift_cloud(scene, progress, say)
         notes = scene.cloud().all_notes()
     else:
-        splats, notes = load_scene(scene, say), scene.notes
+        splats = load_scene(scene, say)
+        notes = scene.notes
     counted(len(splats))
     yield Reduction(InMemory(splats), given, notes=notes, **options, **callbacks)
 
@@ -359,15 +370,15 @@ def simplify(
     """
     fields = {"method": method, "keep_region": keep_region}
     given = {name: value for name, value in fields.items() if value is not None}
-    config = configured(config or SimplifyConfig(), settings=given | dict(settings or {}))
-    wanted = Budget(count_of(count), ratio, fit=fit, min_psnr=min_psnr, min_ssim=min_ssim)
+    config = configure(config or SimplifyConfig(), settings=given | dict(settings or {}))
+    wanted = Budget(parse_count(count), ratio, fit=fit, min_psnr=min_psnr, min_ssim=min_ssim)
     name = "scene" if isinstance(scene, Splats) else str(scene)
     given_views = GivenViews(views, beside, up, seed)
     inputs: dict[str, Any] = {"given": given_views, "blind": blind, "progress": progress, "say": say}
     source = scene if isinstance(scene, Splats) else Source(scene, render_model)
     PointChoice(box, where, color).narrow(source, progress)
-    with reducing(source, config=config, **inputs) as reduce:
-        budget = reduce.resolved(wanted, name, f"scene.{format}")
+    with open_reduction(source, config=config, **inputs) as reduce:
+        budget = reduce.resolve(wanted, name, f"scene.{format}")
         small = reduce(budget.count)
     assert isinstance(small, Simplified)  # not in tiles
     say_gaps(small.report.opacity_lost, say)

@@ -13,15 +13,15 @@ from g2ard.io import Source
 from g2ard.io.types import Cloud, Points, ViewSet
 from g2ard.jobs.budget import Budget
 from g2ard.jobs.distill_options import DistillOptions
-from g2ard.jobs.inputs import Views, axes_of, load_scene, read_points, split_views
+from g2ard.jobs.inputs import Views, find_axes, load_scene, read_points, split_views
 from g2ard.jobs.start_points import (
+    choose_count,
+    find_sparse_file,
     is_sparse_file,
-    placed_source,
-    rough_points,
-    sparse_file,
-    sparse_points,
-    topped_up,
-    usual_count,
+    keep_seen_points,
+    read_sparse_points,
+    scatter_points,
+    top_up_points,
 )
 from g2ard.pipeline.dense import Dense, InMemory
 from g2ard.progress import Progress, Say
@@ -67,9 +67,10 @@ class Start:
     views: tuple[ViewSet, Cameras] | None = None
 
 
-def start_in_tiles(scene: Source, options: DistillOptions, tiles: Opened, say: Say) -> Start:
+def describe_tiled_start(scene: Source, options: DistillOptions, tiles: Opened, say: Say) -> Start:
     """Describe a scene in tiles, or the lift of a point cloud."""
-    lifted, with_photos = scene.kind == "points", tiles.views is not None
+    lifted = scene.kind == "points"
+    with_photos = tiles.views is not None
     if lifted and not with_photos:
         say(_NO_PHOTOS)
     return Start(
@@ -95,7 +96,7 @@ def read_start(
     """Read the dense scene, or lift points; with photos they are topped up to the budget.
 
     Args:
-        planned: see `g2ard.jobs.distill.preparing`.
+        planned: see `g2ard.jobs.distill.open_job`.
     """
     if isinstance(scene, Splats):
         options.check_trained()
@@ -106,19 +107,20 @@ def read_start(
         splats = load_scene(scene.drawn_as(options.render_model), say)
         return Start(InMemory(splats), str(scene), options.beside or scene.path, len(splats))
     if options.photo_views is not None:
-        return _start_of_photos(scene, options.photo_views, budget, options, progress, say, planned=planned)
+        return _read_photo_start(scene, options.photo_views, budget, options, progress, say, planned=planned)
     if scene is None:
         raise InputError("missing; without a scene, pass photos with poses as views", parameter="scene")
     name = "cloud" if isinstance(scene, Points) else str(scene)
     cloud = _as_cloud(scene) if isinstance(scene, Points) else read_points(scene, name, say)
-    xyz, rgb = cloud.points.positions, cloud.points.colors
-    axes = axes_of(cloud, name, say, progress)
+    xyz = cloud.points.positions
+    rgb = cloud.points.colors
+    axes = find_axes(cloud, name, say, progress)
     splats = lift(xyz, rgb, axes=axes, **vars(options.config.lift), progress=progress)
     say(_NO_PHOTOS)
     return Start(InMemory(splats), name, options.beside, len(splats), lifted=True)
 
 
-def _start_of_photos(
+def _read_photo_start(
     scene: Points | Source | None,
     views: Views,
     budget: Budget | None,
@@ -139,7 +141,7 @@ def _start_of_photos(
     found = 0 if points is None else len(points)
     usual = None
     if budget is None:
-        usual = usual_count(train, options.size, found, say)
+        usual = choose_count(train, options.size, found, say)
     wanted = usual or (budget and budget.count) or 0
     if points is None and budget is not None and not wanted:
         raise InputError(
@@ -151,9 +153,9 @@ def _start_of_photos(
     if points is None or scene is None or found < wanted:
         of_photos = True
         if planned:
-            points = rough_points(points, train, wanted)
+            points = scatter_points(points, train, wanted)
         else:
-            points = topped_up(
+            points = top_up_points(
                 points,
                 train,
                 wanted,
@@ -187,14 +189,15 @@ def _read_cloud(
     """
     if isinstance(scene, Points):
         return _as_cloud(scene), "cloud", False
-    file = sparse_file(views)
+    file = find_sparse_file(views)
     if scene is None:
-        return sparse_points(file, say, train), "cloud" if file is None else str(file), True
-    source, of_photos = scene, file is not None and is_sparse_file(scene, views)
+        return read_sparse_points(file, say, train), "cloud" if file is None else str(file), True
+    source = scene
+    of_photos = file is not None and is_sparse_file(scene, views)
     if file is not None and of_photos:
         chosen = Source(file)
         chosen.through = scene.through
-        source = placed_source(chosen, train)
+        source = keep_seen_points(chosen, train)
     return read_points(source, str(scene), say, bare=True), str(scene), of_photos
 
 

@@ -33,7 +33,7 @@ _PHOTO_SIDE = 240
 """Longer side in pixels of the photos used to place points."""
 
 
-def topped_up(
+def top_up_points(
     points: Points | None,
     train: Cameras,
     count: int,
@@ -57,18 +57,19 @@ def topped_up(
     )
 
 
-def rough_points(points: Points | None, train: Cameras, count: int) -> Points:
+def scatter_points(points: Points | None, train: Cameras, count: int) -> Points:
     """Return `count` points for a dry run: those given, and others anywhere among the cameras."""
     own = points or Points(np.zeros((0, 3)), np.zeros((0, 3), np.float32))
     missing = max(0, count - len(own))
     places = train.positions if not len(own) else own.positions
-    low, high = places.min(axis=0), places.max(axis=0)
+    low = places.min(axis=0)
+    high = places.max(axis=0)
     others = np.random.default_rng(0).uniform(low, high + np.ptp(places), (missing, 3))
     shades = np.full((missing, 3), 0.5, np.float32)
     return Points(np.concatenate([own.positions, others]), np.concatenate([own.colors, shades]))
 
 
-def usual_count(train: Cameras, size: int | None, sparse: int, say: Say) -> int:
+def choose_count(train: Cameras, size: int | None, sparse: int, say: Say) -> int:
     """Return the Gaussians of a scene that starts from photos alone, to two digits, and say so.
 
     A Gaussian of SH degree 3 has 59 numbers, as many as 20 pixels. One per 100 pixels of the training photos
@@ -79,9 +80,10 @@ def usual_count(train: Cameras, size: int | None, sparse: int, say: Say) -> int:
         train: training views.
         size: longer side of the photos in pixels, if they are larger.
     """
-    cameras, small = train.resized(size), train.resized(_PHOTO_SIDE)
-    shares = [_shown_share(small, view) for view in evenly_spaced(len(small), _SAMPLED_PHOTOS)]
-    pixels = float((cameras.widths.astype(np.int64) * cameras.heights).sum()) * float(np.mean(shares))
+    cameras = train.resized(size)
+    small = train.resized(_PHOTO_SIDE)
+    shares = [_measure_shown_share(small, view) for view in evenly_spaced(len(small), _SAMPLED_PHOTOS)]
+    pixels = float(cameras.pixels.sum()) * float(np.mean(shares))
     most = max(_MOST_USUAL_COUNT, sparse)
     found = max(1, int(float(f"{min(pixels / _PIXELS_PER_GAUSSIAN, most):.2g}")))
     photos = plural(len(cameras), "photo")
@@ -89,7 +91,7 @@ def usual_count(train: Cameras, size: int | None, sparse: int, say: Say) -> int:
     return found
 
 
-def _shown_share(cameras: Cameras, view: int) -> float:
+def _measure_shown_share(cameras: Cameras, view: int) -> float:
     """Return the share of a view's pixels that show something; 1 without a photo."""
     if cameras.image_paths[view] is None:
         return 1.0
@@ -98,18 +100,19 @@ def _shown_share(cameras: Cameras, view: int) -> float:
     return float((shown if mask is None else shown & mask).mean())
 
 
-def placed_by(train: Cameras, file: Path) -> Cloud:
-    """Read the points of `sparse_file` that training views see, as far as the file states who does."""
-    return placed_source(Source(file), train).cloud(bare=True).whole()
+def read_seen_points(train: Cameras, file: Path) -> Cloud:
+    """Read the points of `find_sparse_file` that training views see, as far as the file states who does."""
+    return keep_seen_points(Source(file), train).cloud(bare=True).whole()
 
 
-def placed_source(scene: Source, train: Cameras) -> Source:
+def keep_seen_points(scene: Source, train: Cameras) -> Source:
     """Return points without those that the file says fewer than two training views see."""
     if scene.format != "points3d":
         return scene
     import g2ard.io.points3d as points3d
 
-    placed, chosen = Source(scene.path), scene.through
+    placed = Source(scene.path)
+    chosen = scene.through
 
     def through(stream: PointStream) -> PointStream:
         seen = points3d.Stream(stream.path, train.names)
@@ -133,21 +136,21 @@ def colored_source(scene: Source, train: Cameras, *, planned: bool) -> Source:
 
 
 def is_sparse_file(scene: Source, views: Views) -> bool:
-    """Return whether points are those of `sparse_file`."""
-    file = sparse_file(views)
-    given = (scene.kind == "views" and sparse_file(scene.path)) or scene.path
+    """Return whether points are those of `find_sparse_file`."""
+    file = find_sparse_file(views)
+    given = (scene.kind == "views" and find_sparse_file(scene.path)) or scene.path
     return file is not None and real_path(given) == real_path(file)
 
 
-def sparse_points(file: Path | None, say: Say = unsaid, train: Cameras | None = None) -> Cloud | None:
-    """Read the points of `sparse_file`; return None, and say why, if no point is readable.
+def read_sparse_points(file: Path | None, say: Say = unsaid, train: Cameras | None = None) -> Cloud | None:
+    """Read the points of `find_sparse_file`; return None, and say why, if no point is readable.
 
     With training views, points that these do not see are skipped.
     """
     try:
         if file is None:
             return None
-        cloud = read_cloud(file, bare=True) if train is None else placed_by(train, file)
+        cloud = read_cloud(file, bare=True) if train is None else read_seen_points(train, file)
     except G2ardError as error:
         say(f"warning: no starting points from photos: {error}")
         return None
@@ -157,7 +160,7 @@ def sparse_points(file: Path | None, say: Say = unsaid, train: Cameras | None = 
     return None
 
 
-def sparse_file(views: Views) -> Path | None:
+def find_sparse_file(views: Views) -> Path | None:
     """Return the file of points of a COLMAP model, of a gsplat run's, of a transforms.json's `ply_file_path`,
     or the input.ply beside INRIA's cameras.json, which may not exist; None for other views."""
     import g2ard.io.colmap as colmap
@@ -168,7 +171,8 @@ def sparse_file(views: Views) -> Path | None:
     if not isinstance(given, str | Path):
         return None
     path = Path(given)
-    found, folder = file_format(path), path if path.is_dir() else path.parent
+    found = file_format(path)
+    folder = path if path.is_dir() else path.parent
     if found == "colmap":
         return colmap.points_file(path)
     if found == "gsplat_run":

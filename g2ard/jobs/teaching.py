@@ -10,8 +10,8 @@ from pathlib import Path
 from g2ard.config.choices import Colour, is_made
 from g2ard.errors import InputError
 from g2ard.io.exposures import find_exposures
-from g2ard.jobs.inputs import Views, load_split_views, scorable
-from g2ard.jobs.run_views import within_pixels
+from g2ard.jobs.inputs import Views, drop_unscorable, load_split_views
+from g2ard.jobs.run_views import limit_pixels
 from g2ard.jobs.view_checks import check_photos, propose_background, warn_of_sight
 from g2ard.pipeline.distill import RunViews
 from g2ard.progress import Say, plural, unsaid
@@ -58,7 +58,7 @@ class Teaching:
         background: Colour,
         *,
         chosen: bool,
-        photos: bool,
+        insisted: bool,
         settings: RasterSettings | None = None,
         rough: bool = False,
         say: Say = unsaid,
@@ -66,13 +66,13 @@ class Teaching:
         """Return the source for commands with a `--teacher`, all whose targets are photos without one.
 
         Args:
-            photos: use photos where views have them, also those that show nothing of the scene.
+            insisted: use photos where views have them, also those that show nothing of the scene.
             settings: conventions of renders.
         """
         render = None
         if teacher is not None:
             render = partial(TeacherRenders, teacher, background=background, settings=settings, lazy=True)
-        return cls(render, photos or teacher is None, background, chosen, photos, rough, say)
+        return cls(render, insisted or teacher is None, background, chosen, insisted, rough, say)
 
     def check_photos(self, scene: Splats, cameras: Cameras, *, renders: bool = False) -> None:
         """Reject photos of another scene, see `g2ard.jobs.view_checks.check_photos`."""
@@ -97,11 +97,11 @@ class Teaching:
         return PhotosOrRenders(cameras, self.render, background=self.background, exposures=exposures)
 
     def full_size(self, cameras: Cameras | None) -> Targets | None:
-        """Return targets of views at their own size, of large views only some (`within_pixels`).
+        """Return targets of views at their own size, of large views only some (`limit_pixels`).
 
         None without such views.
         """
-        return None if cameras is None else scorable(self.targets(within_pixels(cameras)))
+        return None if cameras is None else drop_unscorable(self.targets(limit_pixels(cameras)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,7 +109,7 @@ class RunTargets:
     """Targets of the views of a run, made on access.
 
     Args:
-        train: those for training.
+        train: targets for training.
     """
 
     teaching: Teaching
@@ -123,18 +123,18 @@ class RunTargets:
 
     @cached_property
     def held_out(self) -> Targets:
-        """Those for scoring that have a valid pixel."""
+        """Targets for scoring that have a valid pixel."""
         say = self.teaching.say
-        return scorable(self.teaching.targets(self.views.test, say), say)
+        return drop_unscorable(self.teaching.targets(self.views.test, say), say)
 
     @cached_property
     def validation(self) -> Targets | None:
-        """Those that limit recovery, None without such views."""
+        """Targets that limit recovery, None without such views."""
         return self._of(self.views.validation)
 
     @cached_property
     def apart(self) -> Targets | None:
-        """Those of other kinds for scoring, None without such views."""
+        """Targets in views of other kinds for scoring, None without such views."""
         return self._of(self.views.apart)
 
     @cached_property

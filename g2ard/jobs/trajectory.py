@@ -26,7 +26,8 @@ def read_trajectory(path: Path, names: Sequence[str]) -> dict[str, Float]:
 
     A line is `time tx ty tz qx qy qz qw`, or the rows of a 3×4 matrix; both are world_from_camera.
     """
-    poses, times = list[Float](), list[float]()
+    poses = list[Float]()
+    times = list[float]()
     for place, words in _lines(path):
         values = _numbers(words)
         if len(values) == 12:

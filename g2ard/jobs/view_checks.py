@@ -49,7 +49,7 @@ _BLIND_VIEWS_SHARE = 0.1
 """Share of given views that may see nothing of the scene without a warning."""
 
 
-def given_or_found(
+def take_or_find_views(
     given: GivenViews, splats: Splats, splits: Sequence[str], say: Say
 ) -> tuple[Views | None, bool]:
     """Return given views, or those found beside a scene, and whether they were found; None to generate some.
@@ -72,7 +72,7 @@ def given_or_found(
         say(f"views beside the scene are not used: {error}")
         return None, False
     count = len(found.cameras)
-    seeing = int(found.cameras.facing(opaque_points(splats)).sum())
+    seeing = int(found.cameras.facing(sample_opaque_points(splats)).sum())
     if seeing < _SEEING_CAMERA_SHARE * count:
         say(f"views beside the scene are not used: {path}: {seeing} of {plural(count, 'camera')} see it")
         return None, False
@@ -84,7 +84,7 @@ def given_or_found(
 
 def warn_of_sight(splats: Splats, cameras: Cameras, say: Say) -> None:
     """Warn if more than a tenth of the given views see nothing of the scene."""
-    blind = int((~cameras.facing(opaque_points(splats))).sum())
+    blind = int((~cameras.facing(sample_opaque_points(splats))).sum())
     if blind > _BLIND_VIEWS_SHARE * len(cameras):
         say(
             f"warning: {blind} of {plural(len(cameras), 'view')} see nothing of the scene; check that "
@@ -94,7 +94,7 @@ def warn_of_sight(splats: Splats, cameras: Cameras, say: Say) -> None:
 
 def check_sight(splats: Splats, cameras: Cameras, say: Say = unsaid) -> None:
     """Reject views that contain no Gaussian's centre; otherwise warn like `warn_of_sight`."""
-    if not cameras.facing(splats.means + splats.offset).any():
+    if not cameras.facing(splats.positions).any():
         raise InputError(unseeing(cameras, "the scene"))
     warn_of_sight(splats, cameras, say)
 
@@ -122,7 +122,7 @@ def check_photos(
     pictured = np.flatnonzero([path is not None for path in cameras.image_paths])
     tried = evenly_spaced(len(pictured), _COMPARED_PHOTOS, floor=True)
     photos = Photos(cameras.take(pictured[tried]).resized(_COMPARED_SIDE), background=background)
-    own, beaten = _likeness(splats, photos, background)
+    own, beaten = _compare_photos(splats, photos, background)
     likeness = float(np.median(own)) if own else 0.0
     if likeness >= _UNLIKE or not len(photos.cameras):
         return
@@ -140,22 +140,25 @@ def check_photos(
     )
 
 
-def _likeness(splats: Splats, targets: Photos, background: Colour) -> tuple[list[float], list[float]]:
+def _compare_photos(splats: Splats, targets: Photos, background: Colour) -> tuple[list[float], list[float]]:
     """Return per view that the scene covers enough the correlation of brightness with its own small photo,
     and the share of the others whose correlation is lower, which is empty for a single photo."""
     renderer = Renderer(splats, background=background)
     images = [targets[view].mean(axis=2) for view in range(len(targets.cameras))]
-    own, beaten = [], []
+    own = []
+    beaten = []
     for view, image in enumerate(images):
-        drawn, mask = renderer.render(targets.cameras[view]), mask_of(targets, view)
+        drawn = renderer.render(targets.cameras[view])
+        mask = mask_of(targets, view)
         seen = drawn.alpha > 0.5 if mask is None else (drawn.alpha > 0.5) & mask
         if seen.mean() <= _SHOWN_SHARE:
             continue
         alpha = drawn.alpha[seen]
         rendered = drawn.image[seen].mean(axis=1) / alpha - (1 / alpha - 1) * np.mean(background)
-        (height, width), (rows, columns) = image.shape, np.nonzero(seen)
+        height, width = image.shape
+        rows, columns = np.nonzero(seen)
         found = [
-            _correlation(rendered, other[rows * len(other) // height, columns * other.shape[1] // width])
+            _correlate(rendered, other[rows * len(other) // height, columns * other.shape[1] // width])
             for other in images
         ]
         own.append(found[view])
@@ -165,7 +168,7 @@ def _likeness(splats: Splats, targets: Photos, background: Colour) -> tuple[list
     return own, beaten
 
 
-def _correlation(image: NDArray[np.floating], photo: NDArray[np.floating]) -> float:
+def _correlate(image: NDArray[np.floating], photo: NDArray[np.floating]) -> float:
     """Return the correlation of (N,) values."""
     centred = [values - values.mean() for values in (image, photo)]
     scale = np.linalg.norm(centred[0]) * np.linalg.norm(centred[1])
@@ -199,7 +202,7 @@ def propose_background(cameras: Cameras, background: Colour, given: bool, say: S
         )
 
 
-def as_pool(cameras: Cameras) -> Cameras:
+def size_like_pool(cameras: Cameras) -> Cameras:
     """Resize found cameras without photos to a generated pool's size.
 
     INRIA's file states the size of the full photos, which its trainer had shrunk.
@@ -207,7 +210,7 @@ def as_pool(cameras: Cameras) -> Cameras:
     return cameras if any(cameras.image_paths) else cameras.resized(_VIEW_SIDE)
 
 
-def opaque_points(splats: Splats) -> NDArray[np.float64]:
+def sample_opaque_points(splats: Splats) -> NDArray[np.float64]:
     """Return (K, 3) world means of a sample of the Gaussians of opacity 0.5 or more, otherwise of all."""
     opaque = np.flatnonzero(splats.opacities >= 0.5)
     rows = opaque if len(opaque) else np.arange(len(splats))

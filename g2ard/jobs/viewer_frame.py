@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from g2ard.config.checks import checks_arguments
 from g2ard.config.choices import BLACK, Axes, Colour
 from g2ard.errors import InputError
-from g2ard.jobs.framing import Fields, fields_of
+from g2ard.jobs.framing import Fields, choose_fields
 from g2ard.jobs.inputs import GivenViews, load_views
-from g2ard.jobs.view_checks import given_or_found, opaque_points
+from g2ard.jobs.view_checks import sample_opaque_points, take_or_find_views
 from g2ard.poses import best_views
 from g2ard.poses.site import Site
 from g2ard.progress import Say, unsaid
@@ -67,7 +67,7 @@ class ViewerFrame:
         turn[:3, :3] = self.rotation
         return transform(replace(splats.recentred(self.origin), offset=np.zeros(3), axes="RDF"), turn)
 
-    def placed(self, offset: NDArray[np.float64], axes: Axes = "RDF") -> tuple[list[float], list[float]]:
+    def place(self, offset: NDArray[np.float64], axes: Axes = "RDF") -> tuple[list[float], list[float]]:
         """Return quaternion x y z w and translation that put the files of a scene with this offset and these
         axes where `of` and the viewer put it."""
         turn = _TO_VIEWER @ self.rotation
@@ -95,10 +95,12 @@ class ViewerFrame:
             x, y, z = (float(v) for v in to_viewer @ (point - self.origin))
             return x, y, z
 
-        return Start(there(view.position), there(view.position + depth * ahead), fields or fields_of(view))
+        return Start(
+            there(view.position), there(view.position + depth * ahead), fields or choose_fields(view)
+        )
 
 
-def frame_of(
+def choose_frame(
     scene: Splats,
     given: GivenViews,
     *,
@@ -112,44 +114,49 @@ def frame_of(
         given: the views, and the up direction; None takes it from the views, or estimates it.
         start: name of the initial view; None takes the one that shows most.
     """
-    found, _ = given_or_found(given, scene, [], say)
+    found, _ = take_or_find_views(given, scene, [], say)
     cameras = None if found is None else load_views(found, "all", None, say)
     try:
-        return frame_with(scene, cameras, given.up, start=start)
+        return place_frame(scene, cameras, given.up, start=start)
     except InputError as error:
         if start is not None or cameras is not None:
             raise
         say(f"no pose to start at: {error}")
-        return ViewerFrame(_turn(up_of(scene, given.up)), _middle(scene))
+        return ViewerFrame(_rotate_upright(up_of(scene, given.up)), _find_middle(scene))
 
 
-def frame_with(
+def place_frame(
     scene: Splats, cameras: Cameras | None, up: Sequence[float] | None = None, *, start: str | None = None
 ) -> ViewerFrame:
-    """Choose a frame and an initial camera, from given cameras if there are any, like `frame_of`.
+    """Choose a frame and an initial camera, from given cameras if there are any, like `choose_frame`.
 
     A view that was named is shown whole, others as near as their subject allows. Of photos, only what was
     photographed is shown.
     """
-    up = stated_up(scene) if up is None else up
-    axis = level_up(cameras) if up is None and cameras is not None else None
+    up = read_stated_up(scene) if up is None else up
+    axis = find_shared_up(cameras) if up is None and cameras is not None else None
     axis = up_of(scene, up) if axis is None else axis
     best = best_views(scene, cameras=cameras, axis=axis) if cameras is None or start is None else cameras
     if start and start not in best.names:
         raise InputError(f"no view {start!r} among {', '.join(best.names[:4])}, …", parameter="start")
     view = best[best.names.index(start) if start else 0]
-    stand, points = ViewerFrame(_turn(axis), _middle(scene)), opaque_points(scene)
+    stand = ViewerFrame(_rotate_upright(axis), _find_middle(scene))
+    points = sample_opaque_points(scene)
     photos = cameras if cameras is not None and any(cameras.image_paths) else None
-    fields = fields_of(view, subject=None if start else points, scene=scene, cameras=photos)
+    fields = choose_fields(view, subject=None if start else points, scene=scene, cameras=photos)
     return replace(stand, start=stand.start_at(view, points, fields), name=view.name)
 
 
-def best_level(scene: Splats, count: int, cameras: Cameras, size: tuple[int, int] = (800, 600)) -> Cameras:
+def choose_level_views(
+    scene: Splats, count: int, cameras: Cameras, size: tuple[int, int] = (800, 600)
+) -> Cameras:
     """Return the placed views that show a scene best, upright as other cameras are."""
-    return best_views(scene, count, size=size, axis=level_up(cameras))
+    return best_views(scene, count, size=size, axis=find_shared_up(cameras))
 
 
-def backdrop(given: Colour | None, scenes: Sequence[Splats], *, of_points: bool = False) -> Colour | None:
+def choose_backdrop(
+    given: Colour | None, scenes: Sequence[Splats], *, of_points: bool = False
+) -> Colour | None:
     """Return the colour behind scenes on a page: the given one, or black, on which scenes are trained.
 
     None, a soft gradient, is behind lifts of point clouds and what was made `of_points`, which have gaps.
@@ -160,9 +167,10 @@ def backdrop(given: Colour | None, scenes: Sequence[Splats], *, of_points: bool 
     return None if any(measure_prior(sample).is_lift for sample in samples) else BLACK
 
 
-def level_up(cameras: Cameras) -> NDArray[np.float64] | None:
+def find_shared_up(cameras: Cameras) -> NDArray[np.float64] | None:
     """Return the up direction that views share, or that of photos which all face one way; otherwise None."""
-    across, up = cameras.viewmats[:, 0, :3], -cameras.viewmats[:, 1, :3].mean(axis=0)
+    across = cameras.viewmats[:, 0, :3]
+    up = -cameras.viewmats[:, 1, :3].mean(axis=0)
     values, vectors = np.linalg.eigh(across.T @ across / len(cameras))
     if values[0] <= _LEVEL_SPREAD_RATIO * values[1] and values[1] > _ONE_WAY_SPREAD:
         axis: NDArray[np.float64] = vectors[:, 0]
@@ -171,7 +179,7 @@ def level_up(cameras: Cameras) -> NDArray[np.float64] | None:
     return unit_up(up) if any(cameras.image_paths) and np.linalg.norm(up) > _UPRIGHT_MEAN else None
 
 
-def stated_up(scene: Splats) -> tuple[float, float, float] | None:
+def read_stated_up(scene: Splats) -> tuple[float, float, float] | None:
     """Return the (3,) up direction that a scene's file or, of a scan, its axes state."""
     return scene.up if scene.up is not None or scene.axes == "RDF" else up_in(scene.axes)
 
@@ -196,7 +204,7 @@ def up_of(scene: Splats, up: Sequence[float] | None = None) -> NDArray[np.float6
     >>> np.abs(up_of(Splats.create(floor, scales=flat, logit_opacities=np.full(400, 4)))).round(3).tolist()
     [0.0, 1.0, 0.0]
     """
-    up = stated_up(scene) if up is None else up
+    up = read_stated_up(scene) if up is None else up
     if up is not None:
         return unit_up(up)
     try:
@@ -205,18 +213,19 @@ def up_of(scene: Splats, up: Sequence[float] | None = None) -> NDArray[np.float6
         return np.array([0.0, -1.0, 0.0])
 
 
-def _turn(up: NDArray[np.float64]) -> NDArray[np.float64]:
+def _rotate_upright(up: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the smallest rotation (3, 3) from `up` to −y: I + K + K²/(1 + c).
 
     K is the cross product matrix of up × −y, c the cosine.
     """
     down = np.array([0.0, -1.0, 0.0])
-    (x, y, z), c = np.cross(up, down), float(up @ down)
+    (x, y, z) = np.cross(up, down)
+    c = float(up @ down)
     if c < -1 + 1e-12:
         return np.diag([1.0, -1.0, -1.0])
     k = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     return np.eye(3) + k + k @ k / (1 + c)
 
 
-def _middle(scene: Splats) -> NDArray[np.float64]:
-    return np.median(opaque_points(scene), axis=0)
+def _find_middle(scene: Splats) -> NDArray[np.float64]:
+    return np.median(sample_opaque_points(scene), axis=0)

@@ -63,7 +63,9 @@ class ColourChange:
     gain: float
 
 
-def colour_change(splats: Splats, targets: Targets, background: tuple[float, float, float]) -> ColourChange:
+def fit_colour_change(
+    splats: Splats, targets: Targets, background: tuple[float, float, float]
+) -> ColourChange:
     """Fit the affine colour map (exposure, white balance) from a scene's renders to images.
 
     A pixel is C + (1 − A)·background, C = Σ αT·c and A = Σ αT, and matrix·C + A·shift + (1 − A)·background
@@ -72,12 +74,14 @@ def colour_change(splats: Splats, targets: Targets, background: tuple[float, flo
     """
     cameras = targets.cameras
     behind = np.asarray(background)
-    normal, right = np.zeros((4, 4)), np.zeros((4, 3))
+    normal = np.zeros((4, 4))
+    right = np.zeros((4, 3))
     before = pixels = 0.0
     renderer = Renderer(splats, background=background)
     for view in evenly_spaced(len(cameras), _FITTED_VIEWS):
         rendered = renderer.render(cameras[view])
-        image, mask = targets[view], mask_of(targets, view)
+        image = targets[view]
+        mask = mask_of(targets, view)
         counts = np.ones(image.shape[:2], bool) if mask is None else mask
         rows = np.flatnonzero(counts)[:: max(1, int(counts.sum()) // _FITTED_PIXELS)]
         alpha = rendered.alpha.reshape(-1, 1)[rows].astype(np.float64)
@@ -97,7 +101,7 @@ def colour_change(splats: Splats, targets: Targets, background: tuple[float, flo
     return ColourChange(np.eye(3) + change[:3].T, change[3], gain)
 
 
-def recoloured(splats: Splats, change: ColourChange) -> Splats:
+def recolour(splats: Splats, change: ColourChange) -> Splats:
     """Change the colours of a scene: all bands by the matrix, the base also by the shift."""
     matrix = change.matrix.astype(np.float32)
     rest = (change.matrix.sum(1) * 0.5 + change.shift - 0.5) / SH_C0
@@ -105,7 +109,7 @@ def recoloured(splats: Splats, change: ColourChange) -> Splats:
     return replace(splats, sh0=base, shN=splats.shN @ matrix.T)
 
 
-def views_seeing(splats: Splats, cameras: Cameras) -> NDArray[np.float64]:
+def count_views_seeing(splats: Splats, cameras: Cameras) -> NDArray[np.float64]:
     """Return (N,) the number of views that see each Gaussian; each counts w/(w + 10), w = Σ αT in a small
     render."""
     small = cameras.resized(_VISIBILITY_SIDE)
@@ -116,7 +120,7 @@ def views_seeing(splats: Splats, cameras: Cameras) -> NDArray[np.float64]:
     return out
 
 
-def blended_appearance(start: Splats, fitted: Splats, share: NDArray[np.float64]) -> Splats:
+def blend_appearance(start: Splats, fitted: Splats, share: NDArray[np.float64]) -> Splats:
     """Interpolate colours and opacity logits from `start` to `fitted` by the (N,) `share`."""
     s = share.astype(np.float32)
 
@@ -131,13 +135,13 @@ def blended_appearance(start: Splats, fitted: Splats, share: NDArray[np.float64]
     )
 
 
-def appearance_only(schedule: Schedule) -> Schedule:
+def freeze_geometry(schedule: Schedule) -> Schedule:
     """Return the schedule with the rates of geometry set to 0."""
     return replace(schedule, rates=replace(schedule.rates, means=0.0, log_scales=0.0, quats=0.0))
 
 
-_TUNED = appearance_only(TUNED)
-_PAPER = appearance_only(PAPER)
+_TUNED = freeze_geometry(TUNED)
+_PAPER = freeze_geometry(PAPER)
 
 
 @dataclass(frozen=True)
@@ -149,7 +153,7 @@ class AdaptConfig(FitConfig, tag="schedule"):
             steps at once, with rates that decay to a tenth, without colour change or blending.
         steps: maximum number of steps. None takes 50 per image, at least 250 and at most the paper's 7,000,
             which "paper" always takes.
-        recovery: rates and decay of a stretch with frozen geometry, see `appearance_only`.
+        recovery: rates and decay of a stretch with frozen geometry, see `freeze_geometry`.
 
     Raises:
         InputError: a value out of range.
@@ -167,7 +171,7 @@ class AdaptConfig(FitConfig, tag="schedule"):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.recovery != appearance_only(self.recovery):
+        if self.recovery != freeze_geometry(self.recovery):
             raise InputError(
                 "expected rates of 0 for means, log_scales and quats, because geometry is frozen",
                 parameter="recovery",
@@ -193,7 +197,9 @@ class AdaptConfig(FitConfig, tag="schedule"):
         most = self.most_steps(count)
         if not isinstance(self, Stretched):
             return [most]
-        out, length, left = [], self.first_stretch, most
+        out = []
+        length = self.first_stretch
+        left = most
         while left >= 2 * length:
             out.append(length)
             left -= length
@@ -280,7 +286,9 @@ def _fit(
     start: Splats, targets: Targets, config: AdaptConfig, steps: Steps, progress: Progress
 ) -> tuple[list[Splats], list[RecoverReport]]:
     """Recover with frozen geometry until a stretch gains less than the tolerance; return each one's scene."""
-    scene, before, images = start, 0, len(targets.cameras)
+    scene = start
+    before = 0
+    images = len(targets.cameras)
     most = config.most_steps(images)
     scenes: list[Splats] = []
     reports: list[RecoverReport] = []
@@ -323,7 +331,7 @@ def adapt(
     """Refit spherical harmonics and opacities to targets; means, rotations and scales stay.
 
     First, one affine map c ↦ M·(c, 1) is applied to all colours if it gains enough (M (3, 4) by least
-    squares, `g2ard.pipeline.adapt.colour_change`), so that a change of light is right in unseen places
+    squares, `g2ard.pipeline.adapt.fit_colour_change`), so that a change of light is right in unseen places
     too. Second, each Gaussian's appearance is fitted with L = (1−λ)·L1 + λ·(1−SSIM) as in recovery, without
     regularisers. Last, a Gaussian seen by v images moves v/(v + prior_views) of the way to its fit. PSNR on
     other trajectories then measures the geometry (`tab:geobase`).
@@ -352,21 +360,24 @@ def adapt(
     >>> darker.report.psnr.after > darker.report.psnr.before
     True
     """
-    config, targets = config or AdaptConfig(), checked_targets(targets)
+    config = config or AdaptConfig()
+    targets = checked_targets(targets)
     given = compact if config.sh_degree is None else compact.with_sh_degree(config.sh_degree)
     probe = Probe(targets, config.background)
     progress("adapt", 0, 0)
-    change, start, share = None, given, np.ones(len(given))
+    change = None
+    start = given
+    share = np.ones(len(given))
     if isinstance(config, Stretched) and len(given) and len(targets.cameras):
-        change = colour_change(given, targets, config.background)
+        change = fit_colour_change(given, targets, config.background)
         change = change if change.gain >= config.colour_worth else None
-        start = given if change is None else recoloured(given, change)
+        start = given if change is None else recolour(given, change)
     scenes, fits = _fit(start, targets, config, Steps(work, progress), progress)
     progress("adapt", 0, 0)
     if config.prior_views:
-        seen = views_seeing(start, targets.cameras)
+        seen = count_views_seeing(start, targets.cameras)
         share = seen / (seen + config.prior_views)
-    result = blended_appearance(start, scenes[-1], share)
+    result = blend_appearance(start, scenes[-1], share)
     exposure = next((fit.exposure for fit in reversed(fits) if fit.exposure), None)
     if exposure is not None:
         probe.fit_exposures()

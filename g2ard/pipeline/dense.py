@@ -54,7 +54,7 @@ class Dense(Protocol):
     def identity(self) -> list[str]:
         """Return what identifies the Gaussians that are not in the sample."""
 
-    def merged(
+    def merge(
         self,
         count: int,
         views: Cameras | None,
@@ -77,7 +77,7 @@ class Dense(Protocol):
     def opacity_lost(self, result: Splats, views: Cameras) -> float:
         """Return the share of light that a result lets through, see `g2ard.stages.simplify.gaps`."""
 
-    def derived(self, scene: Splats | PartsStream, name: str) -> Dense:
+    def derive(self, scene: Splats | PartsStream, name: str) -> Dense:
         """Return a scene that was merged from this one as a dense scene."""
 
 
@@ -103,7 +103,7 @@ class InMemory:
         """Return nothing, since all Gaussians are in the sample."""
         return []
 
-    def merged(
+    def merge(
         self,
         count: int,
         views: Cameras | None,
@@ -137,16 +137,17 @@ class InMemory:
         """Return the share of light that a result lets through."""
         return opacity_lost(self.splats, result, views)
 
-    def derived(self, scene: Splats | PartsStream, name: str) -> InMemory:
+    def derive(self, scene: Splats | PartsStream, name: str) -> InMemory:
         """Return a scene that was merged from this one."""
-        return InMemory(whole(scene))
+        return InMemory(load_whole(scene))
 
 
 class _Remembering:
     """A source of visibility that keeps that of its first scene, with which every reduction starts."""
 
     def __init__(self, source: VisibilitySource, views: Cameras) -> None:
-        self.source, self.views = source, views
+        self.source = source
+        self.views = views
         self.first: tuple[list[NDArray[Any]], SampledVisibility] | None = None
 
     def __call__(self, scene: Splats) -> SampledVisibility:
@@ -164,11 +165,11 @@ def as_dense(prior: Splats | Dense) -> Dense:
     """Return a dense scene: the given one, or one in memory of Gaussians."""
     if isinstance(prior, Splats):
         return InMemory(prior.narrowed())
-    if not hasattr(type(prior), "merged"):
+    if not hasattr(type(prior), "merge"):
         raise InputError(f"expected Splats or tiles, got {type(prior).__name__}", parameter="prior")
     return prior
 
 
-def whole(scene: Splats | PartsStream) -> Splats:
+def load_whole(scene: Splats | PartsStream) -> Splats:
     """Return a merged scene in memory."""
     return scene.whole() if isinstance(scene, PartsStream) else scene

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from g2ard.config.checks import checks_arguments
 from g2ard.io.types import ViewSet
 from g2ard.pipeline.config import DistillConfig, SelectConfig
-from g2ard.pipeline.dense import Dense, InMemory, as_dense, whole
+from g2ard.pipeline.dense import Dense, InMemory, as_dense, load_whole
 from g2ard.pipeline.steps import Steps
 from g2ard.progress import Progress, plural, silent
 from g2ard.rendering.targets import Exposed, Photos, PhotosOrRenders, Subset, Targets, checked_targets
@@ -107,7 +107,7 @@ class Distilled(Shown):
             scores = f", PSNR {self.scores.psnr:.2f} dB in {self.scores.scored_in}"
         return f"Distilled({plural(len(self.splats), 'Gaussian')}{scores})"
 
-    def scored_on(self, held_out: Targets) -> Targets:
+    def match_exposures(self, held_out: Targets) -> Targets:
         """Return the targets, to be scored after a fit of exposures if the training photos differ."""
         recoveries = (recovery for entry in self.report.rounds for recovery in entry.recover)
         return Exposed(held_out) if any(done.exposure for done in recoveries) else held_out
@@ -157,23 +157,28 @@ def distill(
         InputError: the budget does not fit, or no view sees the prior.
         KeyboardInterrupt: after Ctrl-C; the same call resumes from `work`.
     """
-    config, targets = config or DistillConfig(), checked_targets(targets)
+    config = config or DistillConfig()
+    targets = checked_targets(targets)
     dense = as_dense(prior)
     if validation is not None:
         validation = checked_targets(validation, "validation")
-    schedule, steps = config.recover.schedule, Steps(work, progress)
-    counts = round_counts(dense, budget, config)
+    schedule = config.recover.schedule
+    steps = Steps(work, progress)
+    counts = plan_round_counts(dense, budget, config)
     given = check_weights(weights, len(targets.cameras))
     photos = isinstance(targets, Photos | PhotosOrRenders)
-    total, protected, selecting, log = dense.total, None, 0.0, []
+    total = dense.total
+    protected = None
+    selecting = 0.0
+    log = []
     for number, count in enumerate(counts, start=1):
         if number == 1 or config.select.reselect:
             began = time.monotonic()
-            rows, weighed, views = selected(dense.sample, targets.cameras, config, given, progress)
+            rows, weighed, views = select_views(dense.sample, targets.cameras, config, given, progress)
             chosen = targets if rows is None else Subset(targets, rows)
             selecting += time.monotonic() - began
         drawn = (chosen, validation) if budget < total else ()  # it may be its own teacher
-        simplified, report, protected = _simplified(
+        simplified, report, protected = _simplify_round(
             steps,
             number,
             dense,
@@ -185,22 +190,26 @@ def distill(
             progress,
             drawn,
         )
-        scene, recoveries = simplified, []
-        final = number == len(counts)
-        for name in [f"round-{number}"] * (schedule.round_steps > 0) + [_FINAL] * final:
+        scene = simplified
+        recoveries = []
+        names = [f"round-{number}"] if schedule.round_steps else []
+        if number == len(counts):
+            names.append(_FINAL)
+        for name in names:
+            final = name == _FINAL
             scene, recovery = steps.recover(
                 name,
                 scene,
                 chosen,
-                _recovery(config.recover, scene, chosen.cameras, len(counts), photos, name == _FINAL),
+                _configure_recovery(config.recover, scene, chosen.cameras, len(counts), photos, final),
                 built=simplified,
                 weights=weighed,
                 validation=validation,
                 filled=bool(drawn),
-                stage="recover" if name == _FINAL else f"recover {name}",
+                stage="recover" if final else f"recover {name}",
                 watch=watch,
                 skip_same=True,
-                time_left=time_left if name == _FINAL else None,
+                time_left=time_left if final else None,
             )
             recoveries.append(recovery)
         dense = InMemory(scene)
@@ -215,7 +224,7 @@ def distill(
     return Distilled(scene, simplified, DistillReport(tuple(log), seconds, views))
 
 
-def round_counts(dense: Dense, budget: int, config: DistillConfig) -> list[int]:
+def plan_round_counts(dense: Dense, budget: int, config: DistillConfig) -> list[int]:
     """Return the count after each round. Those that memory does not hold are passed over."""
     if not config.recover.schedule.round_steps:
         return [budget]
@@ -223,7 +232,7 @@ def round_counts(dense: Dense, budget: int, config: DistillConfig) -> list[int]:
     return [count for count in counts if count <= dense.most_rows and count > budget] + [budget]
 
 
-def selected(
+def select_views(
     scene: Splats, cameras: Cameras, config: DistillConfig, given: NDArray[Any] | None, progress: Progress
 ) -> tuple[NDArray[Any] | None, NDArray[Any] | None, ViewsReport | None]:
     """Select the views that see `scene`; return their rows, None for all, their weights and a report.
@@ -257,7 +266,7 @@ def selected(
     return chosen.order[order], weights, report
 
 
-def draw_weights(
+def choose_draw_weights(
     scene: Splats, train: ViewSet, config: DistillConfig, progress: Progress = silent
 ) -> NDArray[np.float64] | None:
     """Return the weights by which all training views are drawn, as stated or selected; 0 is never drawn.
@@ -265,7 +274,7 @@ def draw_weights(
     None draws them equally often.
     """
     given = train.weights if config.select.weighted else None
-    rows, weights, _ = selected(scene, train.cameras, config, given, progress)
+    rows, weights, _ = select_views(scene, train.cameras, config, given, progress)
     if weights is None or rows is None:
         return weights
     every = np.zeros(len(train.cameras))
@@ -273,7 +282,7 @@ def draw_weights(
     return every
 
 
-def _simplified(
+def _simplify_round(
     steps: Steps,
     number: int,
     dense: Dense,
@@ -296,7 +305,7 @@ def _simplified(
     def step(_: Path | None) -> tuple[Splats, SimplifyReport, dict[str, Any]]:
         steps.fill(*drawn)
         began = time.monotonic()
-        done = dense.merged(
+        done = dense.merge(
             count,
             None if blind else cameras,
             config.simplify,
@@ -306,20 +315,22 @@ def _simplified(
         )
         report = replace(done.report, seconds=time.monotonic() - began)
         flags = np.zeros(count, bool) if done.protected is None else done.protected
-        return whole(done.splats), report, {"protected": flags}
+        return load_whole(done.splats), report, {"protected": flags}
 
-    name, like = f"simplified-{number}", dense.sample
+    name = f"simplified-{number}"
+    like = dense.sample
     done, report, arrays = steps.run(name, like, lambda: content, SimplifyReport, step)
     if config.recover.sh_degree is not None:
         done = done.with_sh_degree(config.recover.sh_degree)
     return done, report, arrays["protected"]
 
 
-def _recovery(
+def _configure_recovery(
     config: RecoverConfig, scene: Splats, cameras: Cameras, rounds: int, of_photos: bool, final: bool
 ) -> RecoverConfig:
     """Return the settings of one recovery: the steps of the last one, or its share of the time for all."""
-    schedule, limit = config.schedule, config.recovery_time
+    schedule = config.schedule
+    limit = config.recovery_time
     if limit is None:
         steps = config.final_steps(scene, cameras, of_photos=of_photos) if final else None
         return replace(config, steps=steps, final=final)

@@ -36,7 +36,7 @@ PRESETS: dict[str, dict[str, Any]] = {
 """Preset name → values by path. `auto` and `paper` choose their regularisers by measuring the scene."""
 
 
-def configured(config: Config, preset: str = "auto", settings: Mapping[str, Any] | None = None) -> Config:
+def configure(config: Config, preset: str = "auto", settings: Mapping[str, Any] | None = None) -> Config:
     """Apply a preset to a config, then individual settings.
 
     A schedule given by name is scaled to `recover.steps`. The paper's schedule implies SH degree 3.
@@ -46,7 +46,7 @@ def configured(config: Config, preset: str = "auto", settings: Mapping[str, Any]
         settings: values by path or unambiguous tail.
 
     >>> from g2ard.stages.recover.config import RecoverConfig
-    >>> config = configured(RecoverConfig(), "paper", {"steps": 3000})
+    >>> config = configure(RecoverConfig(), "paper", {"steps": 3000})
     >>> config.schedule.steps, config.schedule.round_steps, config.sh_degree
     (3000, 800, 3)
     """
@@ -55,7 +55,8 @@ def configured(config: Config, preset: str = "auto", settings: Mapping[str, Any]
     require("preset", repr(preset), preset in PRESETS, f"one of {', '.join(PRESETS)}")
     given = full_paths(settings or {}, config)
     values = {**PRESETS[preset], **given}
-    schedule, steps = values.get("recover.schedule", "default"), values.get("recover.steps")
+    schedule = values.get("recover.schedule", "default")
+    steps = values.get("recover.steps")
     if isinstance(schedule, str):
         given = dict(given)
         if schedule == "paper":
@@ -96,4 +97,4 @@ def preset(name: str = "paper", config: Any = None) -> Any:
     config = DistillConfig() if config is None else config
     known = is_dataclass(config) and not isinstance(config, type)
     require("config", repr(config), known, "a config, such as AdaptConfig()")
-    return configured(config, name)
+    return configure(config, name)

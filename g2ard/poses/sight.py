@@ -138,7 +138,7 @@ class Glance:
         scales = np.sort(sample.scales.astype(np.float64), axis=1)
         self.sizes = np.sqrt(scales[:, 1] * scales[:, 2])
         self._middle = sample.offset + np.median(sample.means.astype(np.float64), axis=0)
-        means = sample.means.astype(np.float64) + sample.offset - self._middle
+        means = sample.positions - self._middle
         most = _MOST_WIDENED * limit / _ROWS
         widen = min(most, np.sqrt(represents * len(rows) / max(1, len(some))))
         shortest = np.arange(3) == np.argmin(sample.scales, axis=1)[:, None]

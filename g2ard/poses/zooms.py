@@ -40,7 +40,7 @@ def zoomed(scene: Splats, cameras: Cameras, *, represents: float = 1.0, share: f
     """
     some = take_evenly(scene, _SAMPLE)
     some = some.take(some.opacities > _SOLID)
-    points = some.means.astype(np.float64) + some.offset
+    points = some.positions
     axes = np.sort(some.scales.astype(np.float64), axis=1)
     sizes = np.sqrt(axes[:, 1] * axes[:, 2] / represents)
     small = []

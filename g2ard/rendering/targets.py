@@ -515,8 +515,7 @@ class TeacherRenders(Cached):
         """Render the views, all by default, that the cache will hold, so that later steps take equal time."""
         views = range(len(self.cameras)) if views is None else views
         missing = np.array([view for view in views if view not in self._kept], np.int64)
-        pixels = self.cameras.widths.astype(np.int64) * self.cameras.heights
-        sizes = np.cumsum(3 * np.uint16().nbytes * pixels[missing])
+        sizes = np.cumsum(3 * np.uint16().nbytes * self.cameras.pixels[missing])
         count = int((sizes <= self._limit - self._bytes).sum())
         for number, _ in enumerate(in_threads(self._stored, missing[:count].tolist()), 1):
             progress("targets", number, count)

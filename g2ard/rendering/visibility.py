@@ -112,7 +112,7 @@ def overdraw(splats: Splats, cameras: Cameras, progress: Progress = silent) -> f
     """
     faint = RasterSettings(alpha_max=1 / 255)  # comes after the test, so that light is never used up
     seen = visibility(splats, cameras, progress, settings=faint)
-    return float(seen.hits.sum() / (cameras.widths.astype(np.int64) * cameras.heights).sum())
+    return float(seen.hits.sum() / cameras.pixels.sum())
 
 
 def visibility_source(cameras: Cameras, *, longest: int = LONGEST, progress: Progress = silent) -> _Sampler:

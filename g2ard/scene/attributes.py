@@ -11,7 +11,7 @@ from g2ard.scene.shape import elongation
 from g2ard.scene.splats import Splats
 
 _TABLE: dict[tuple[str, ...], Callable[[Splats], NDArray[Any]]] = {
-    ("x", "y", "z"): lambda splats: splats.means.astype(np.float64) + splats.offset,
+    ("x", "y", "z"): lambda splats: splats.positions,
     ("opacity",): lambda splats: splats.opacities[:, None],
     ("scale_x", "scale_y", "scale_z"): lambda splats: splats.scales,
     ("rot_w", "rot_x", "rot_y", "rot_z"): lambda splats: splats.quats,

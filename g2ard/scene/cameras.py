@@ -229,6 +229,16 @@ class Cameras(Shown):
             "has a focal length that is not positive": (self.Ks[:, [0, 1], [0, 1]] <= 0).any(1),
         }
 
+    @property
+    def pixels(self) -> NDArray[np.int64]:
+        """(C,) number of pixels."""
+        return self.widths * self.heights
+
+    @property
+    def sides(self) -> NDArray[np.int64]:
+        """(C,) longer side in pixels."""
+        return np.maximum(self.widths, self.heights)
+
     def __repr__(self) -> str:
         return f"Cameras({plural(len(self), 'view')})"
 
@@ -320,19 +330,19 @@ class Cameras(Shown):
         """Return the views with their longer side shrunk to at most `longest` pixels (None keeps them)."""
         if longest is None:
             return self
-        return self._by(np.minimum(1.0, longest / np.maximum(self.widths, self.heights)))
+        return self._by(np.minimum(1.0, longest / self.sides))
 
     def fitted(self, longest: int | None) -> Cameras:
         """Return the views at a requested longer side; photos only shrink, and None keeps all."""
         if longest is None:
             return self
-        factor = longest / np.maximum(self.widths, self.heights)
+        factor = longest / self.sides
         pictured = [path is not None for path in self.image_paths]
         return self._by(np.where(pictured, np.minimum(1.0, factor), factor))
 
     def scaled(self, longest: int) -> Cameras:
         """Return the views with a longer side of `longest` pixels, also if they are smaller."""
-        return self._by(longest / np.maximum(self.widths, self.heights))
+        return self._by(longest / self.sides)
 
     def sized(self, width: int, height: int) -> Cameras:
         """Return the views at exactly this size, each with all that it shows."""

@@ -23,7 +23,7 @@ def evenly_spaced(count: int, most: int, *, floor: bool = False) -> list[int]:
 
 
 class Rows(Protocol[T_co]):
-    """What has rows, such as Gaussians or views."""
+    """Rows that can be taken, such as Gaussians or views."""
 
     def __len__(self) -> int: ...
     def take(self, index: NDArray[np.int64], /) -> T_co: ...

@@ -171,6 +171,11 @@ class Splats(Shown):
         return (0.5 + SH_C0 * self.sh0[:, 0]).astype(np.float32)
 
     @property
+    def positions(self) -> NDArray[np.float64]:
+        """Means in world coordinates, (N, 3): with the offset."""
+        return self.means.astype(np.float64) + self.offset
+
+    @property
     def nbytes(self) -> int:
         """Bytes of all arrays in float32, as in a .ply."""
         return 4 * len(self) * (14 + 3 * self.shN.shape[1])

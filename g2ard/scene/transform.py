@@ -404,7 +404,7 @@ def one_model(models: Sequence[RenderModel]) -> RenderModel:
 
 def in_box(splats: Splats, low: ArrayLike, high: ArrayLike) -> NDArray[np.bool_]:
     """Return the (N,) mask of means in an axis-aligned box (inclusive), world coordinates."""
-    return within_box(splats.means.astype(np.float64) + splats.offset, low, high)
+    return within_box(splats.positions, low, high)
 
 
 def within_box(world: NDArray[np.float64], low: ArrayLike, high: ArrayLike) -> NDArray[np.bool_]:
@@ -423,6 +423,5 @@ def in_sphere(splats: Splats, center: ArrayLike, radius: float) -> NDArray[np.bo
     """Return the (N,) mask of means within `radius` of `center`, world coordinates."""
     if not radius > 0:
         raise InputError(f"expected a radius > 0, got {radius:g}", parameter="sphere")
-    world = splats.means.astype(np.float64) + splats.offset
-    away = world - np.asarray(center, np.float64)
+    away = splats.positions - np.asarray(center, np.float64)
     return (away * away).sum(axis=1) <= radius * radius

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from g2ard.config.choices import BLACK, Colour
 from g2ard.io.stream import PartsStream
 from g2ard.io.tile_store import TileStore
-from g2ard.pipeline.dense import InMemory, whole
+from g2ard.pipeline.dense import InMemory, load_whole
 from g2ard.progress import Progress, silent
 from g2ard.rendering.boxes import front_to_back
 from g2ard.rendering.recolour import seen_by, shifted
@@ -89,7 +89,7 @@ class InTiles:
         """Return the key of the tiles."""
         return [self.store.key]
 
-    def merged(
+    def merge(
         self,
         count: int,
         views: Cameras | None,
@@ -108,7 +108,7 @@ class InTiles:
         merged = simplify_tiles(self._run, count, views, final_budget)
         if count > self.most_rows:
             return merged
-        small, report = whole(merged.splats), merged.report
+        small, report = load_whole(merged.splats), merged.report
         if views is None or count == self.total:
             return replace(merged, splats=small)
         usual = usual_and_others(views)[0].resized(LONGEST)
@@ -164,9 +164,9 @@ class InTiles:
         counts = [int(np.count_nonzero(one.keep)) for one in found]
         scene = scene_in_tiles(self.store, counts, cleaned, key_of(files), self.store.sh_degree)
         kinds = Cleaning(np.concatenate([one.kind for one in found]))
-        return self.derived(scene, "cleaned"), kinds, float(gone / max(light, 1e-30))
+        return self.derive(scene, "cleaned"), kinds, float(gone / max(light, 1e-30))
 
-    def derived(self, scene: Splats | PartsStream, name: str) -> InMemory | InTiles:
+    def derive(self, scene: Splats | PartsStream, name: str) -> InMemory | InTiles:
         """Return a scene that was derived from this one: in memory, or in tiles of its own if it is large."""
         if isinstance(scene, Splats):
             return InMemory(scene)

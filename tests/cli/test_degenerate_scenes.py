@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 import g2ard
-from g2ard.jobs.notebook import html_of
+from g2ard.jobs.notebook import write_html
 from helpers.commands import CommandLine, succeeds
 from helpers.scenes import degenerate_scenes
 
@@ -38,20 +38,23 @@ def test_a_degenerate_scene_is_shown(call: str, name: str, tmp_path: Path, comma
 @pytest.mark.filterwarnings("error::RuntimeWarning")
 @pytest.mark.parametrize("name", SCENES)
 def test_a_notebook_shows_a_degenerate_scene(name: str) -> None:
-    assert "<img" in html_of(SCENES[name])
+    assert "<img" in write_html(SCENES[name])
 
 
 PICTURES = {
     "distill": {
-        "g2ard.jobs.scoring.best_targets": ("choosing views", ("report.html", "preview.png", "view.html")),
+        "g2ard.jobs.scoring.choose_best_targets": (
+            "choosing views",
+            ("report.html", "preview.png", "view.html"),
+        ),
         "g2ard.report.distilled.write_distill_report": ("report.html", ("report.html",)),
         "g2ard.report.distilled.write_preview": ("preview.png", ("preview.png",)),
-        "g2ard.cli.run_folder.frame_with": ("view.html", ("view.html",)),
+        "g2ard.cli.run_folder.place_frame": ("view.html", ("view.html",)),
     },
-    "lod": {"g2ard.jobs.levels.frame_of": ("the page", ("index.html",))},
+    "lod": {"g2ard.jobs.levels.choose_frame": ("the page", ("index.html",))},
     "render": {"g2ard.cli.commands.render._write_sheet": ("--sheet", ("sheet.png",))},
     "clean": {"g2ard.cli.commands.clean._paint": ("--preview", ("found.png",))},
-    "compare": {"g2ard.jobs.viewer_frame.frame_with": ("--output", ("page.html",))},
+    "compare": {"g2ard.jobs.viewer_frame.place_frame": ("--output", ("page.html",))},
     "evaluate": {"g2ard.cli.commands.evaluate._write_ladder": ("--output", ("page.html",))},
 }
 """Command → functions of its pages or pictures, each with what the error names and the missing files."""

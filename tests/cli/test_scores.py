@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import g2ard
-from g2ard.jobs.comparison import common_of
+from g2ard.jobs.comparison import find_common
 from helpers.commands import CommandLine, refused, succeeds
 from helpers.photos import photographed
 from helpers.scenes import around, checkered_ball
@@ -77,13 +77,13 @@ def test_the_order_of_runs_has_no_effect(runs: Path, command_line: CommandLine) 
 def test_no_common_view_has_trained_a_run(runs: Path) -> None:
     pool = around(8, (64, 48))
     run_folder(runs / "other", pool, held_out=2)
-    common = common_of([Path("better"), Path("other")])
+    common = find_common([Path("better"), Path("other")])
     assert common is not None
     assert common.views.cameras.names == ("view_000", "view_004")  # type: ignore[union-attr]
     elsewhere = replace(around(6, (40, 30), distance=4.0), names=pool.names[:6])
     run_folder(runs / "elsewhere", elsewhere)
     both = [
-        common_of(paths)
+        find_common(paths)
         for paths in ([Path("better"), Path("elsewhere")], [Path("elsewhere"), Path("better")])
     ]
     names = [one.views.cameras.names for one in both if one]  # type: ignore[union-attr]

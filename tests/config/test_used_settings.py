@@ -17,14 +17,14 @@ from g2ard.config.schema import values_of
 from g2ard.io import Source
 from g2ard.io.types import ViewSet
 from g2ard.jobs.budget import Budget
-from g2ard.jobs.distill import preparing
+from g2ard.jobs.distill import open_job
 from g2ard.jobs.distill_options import DistillOptions
 from g2ard.jobs.inputs import GivenViews
-from g2ard.jobs.simplify import reducing
+from g2ard.jobs.simplify import open_reduction
 from g2ard.jobs.tile_options import Tiling
-from g2ard.pipeline.adapt import appearance_only
-from g2ard.pipeline.dense import whole
-from g2ard.pipeline.presets import configured
+from g2ard.pipeline.adapt import freeze_geometry
+from g2ard.pipeline.dense import load_whole
+from g2ard.pipeline.presets import configure
 from g2ard.scene.splats import SH_C0
 from g2ard.stages.lift import LiftConfig
 from g2ard.stages.recover.config import Schedule
@@ -113,7 +113,7 @@ ADAPT: dict[str, Any] = {
     "prior_views": 9.0,
     "first_stretch": 1,
     "colour_worth": 99.0,
-    "recovery": replace(appearance_only(Schedule.named("paper")), final_rate=0.5),
+    "recovery": replace(freeze_geometry(Schedule.named("paper")), final_rate=0.5),
 }
 REGISTER: dict[str, Any] = {
     "size": 100,
@@ -175,7 +175,7 @@ def _selected(policy: str) -> Callable[[Mapping[str, Any]], object]:
     def run(settings: Mapping[str, Any]) -> object:
         named = {f"select.{name}": value for name, value in settings.items()}
         chosen_by = {"policy": policy, "views_count": 5}
-        options = configured(g2ard.DistillConfig(), settings={**chosen_by, **named}).select
+        options = configure(g2ard.DistillConfig(), settings={**chosen_by, **named}).select
         chosen = g2ard.select(SCENE, VIEWS, 5, policy=policy, options=options)
         return chosen.order.tolist(), chosen.gains.tolist()
 
@@ -188,7 +188,7 @@ def _lifted(settings: Mapping[str, Any]) -> object:
 
 
 def _adapted(settings: Mapping[str, Any]) -> object:
-    config = configured(g2ard.AdaptConfig(), settings={f"adapt.{name}": v for name, v in settings.items()})
+    config = configure(g2ard.AdaptConfig(), settings={f"adapt.{name}": v for name, v in settings.items()})
     return g2ard.adapt(SMALL, TARGETS, config).splats.fingerprint()
 
 
@@ -251,15 +251,15 @@ def _tiles() -> tuple[Path, Tiling]:
 
 def _simplified_in_tiles(settings: Mapping[str, Any]) -> object:
     scene, tiling = _tiles()
-    config = configured(g2ard.SimplifyConfig(), settings=settings)
-    with reducing(Source(scene), tiling, given=GivenViews(UNEVEN), config=config) as reduce:
-        return whole(reduce(BUDGET).splats).fingerprint()
+    config = configure(g2ard.SimplifyConfig(), settings=settings)
+    with open_reduction(Source(scene), tiling, given=GivenViews(UNEVEN), config=config) as reduce:
+        return load_whole(reduce(BUDGET).splats).fingerprint()
 
 
 def _distilled_in_tiles(settings: Mapping[str, Any]) -> object:
     scene, tiling = _tiles()
     options = DistillOptions(views=UNEVEN, size=48, settings={**FAR, **settings})
-    with preparing(Source(scene), Budget(count=BUDGET), options, tiling) as job:
+    with open_job(Source(scene), Budget(count=BUDGET), options, tiling) as job:
         return job.run().splats.fingerprint()
 
 
@@ -344,9 +344,9 @@ def test_distill_refuses_settings_without_effect(settings: dict[str, Any], words
 
 
 def test_values_of_a_preset_may_have_no_effect() -> None:
-    configured(g2ard.DistillConfig(), "paper", {"method": "fast", "views_count": None})
+    configure(g2ard.DistillConfig(), "paper", {"method": "fast", "views_count": None})
     with pytest.raises(g2ard.InputError, match="has no effect on the method fast"):
-        configured(g2ard.SimplifyConfig(), "paper", {"method": "fast", "fold": 0.5})
+        configure(g2ard.SimplifyConfig(), "paper", {"method": "fast", "fold": 0.5})
 
 
 _BESIDES = (
@@ -382,7 +382,7 @@ def test_a_variant_has_only_its_own_settings(root: Any) -> None:
         for name in every.keys() - vars(own).keys():
             for make in (
                 lambda: root(**{tag: variant, name: every[name]}),  # noqa: B023
-                lambda: configured(root(), settings={f"{path}.{tag}": variant, name: every[name]}),  # noqa: B023
+                lambda: configure(root(), settings={f"{path}.{tag}": variant, name: every[name]}),  # noqa: B023
             ):
                 with pytest.raises(
                     g2ard.InputError, match=rf"{name}: has no effect on the {tag} {variant}, only"

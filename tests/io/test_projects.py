@@ -14,7 +14,7 @@ from g2ard.io.finding import Finder
 from g2ard.io.photos import load_mask, load_photo
 from g2ard.io.types import ViewFiles
 from g2ard.io.views import read_view_set
-from g2ard.jobs.start_points import sparse_file, sparse_points
+from g2ard.jobs.start_points import find_sparse_file, read_sparse_points
 from helpers.view_files import colmap, edit, orbit, photo, transforms
 
 NAMES = [f"photo {i}.png" for i in range(4)]
@@ -155,7 +155,7 @@ def test_models_elsewhere_are_read_or_named(tmp_path: Path, text: bool, place: s
     (tmp_path / "kept").rename(tmp_path / place)
     if found:
         assert len(read_views(tmp_path)) == 4
-        assert sparse_points(sparse_file(tmp_path)) is not None
+        assert read_sparse_points(find_sparse_file(tmp_path)) is not None
         return
     with pytest.raises(InputError) as caught:
         read_views(tmp_path)
@@ -170,7 +170,7 @@ def test_tables_in_capitals_are_read(tmp_path: Path, text: bool) -> None:
         file.rename(file.with_name(file.name.capitalize()))
     assert len(read_views(tmp_path)) == 4
     assert kind(tmp_path / "sparse" / "0" / f"Cameras.{'txt' if text else 'bin'}") == "views"
-    assert sparse_points(sparse_file(tmp_path)) is not None
+    assert read_sparse_points(find_sparse_file(tmp_path)) is not None
 
 
 @pytest.mark.parametrize(("small", "large"), [("0", "1"), ("1", "0"), ("2", "10")])
@@ -210,7 +210,7 @@ def test_byte_order_marks(tmp_path: Path, encoding: str) -> None:
         if file.suffix in (".txt", ".json"):
             file.write_bytes(file.read_text().replace("\n", "\r\n").encode(encoding))
     assert len(read_views(tmp_path / "a")) == len(read_views(tmp_path / "b")) == 4
-    assert len(sparse_points(sparse_file(tmp_path / "a")) or ()) == 2
+    assert len(read_sparse_points(find_sparse_file(tmp_path / "a")) or ()) == 2
 
 
 @pytest.mark.parametrize("word", ["nan", "-nan(ind)", "NaN", "inf", "-1.#IND", "1.#QNAN", "nan(snan)"])
@@ -324,14 +324,14 @@ def test_points_of_a_folder_of_smaller_photos(tmp_path: Path) -> None:
     project(tmp_path)
     (tmp_path / "images").rename(tmp_path / "images_2")
     for path in (tmp_path, tmp_path / "images_2", tmp_path / "sparse" / "0"):
-        assert len(sparse_points(sparse_file(path)) or ()) == 2
+        assert len(read_sparse_points(find_sparse_file(path)) or ()) == 2
 
 
 @pytest.mark.parametrize("damage", ["cut", "empty", "missing"])
 @pytest.mark.parametrize("text", [False, True])
 def test_points_that_cannot_be_used_are_a_warning(tmp_path: Path, damage: str, text: bool) -> None:
     project(tmp_path, text)
-    file = sparse_file(tmp_path)
+    file = find_sparse_file(tmp_path)
     assert file is not None
     if damage == "missing":
         file.unlink()
@@ -339,7 +339,7 @@ def test_points_that_cannot_be_used_are_a_warning(tmp_path: Path, damage: str, t
         data = file.read_bytes()
         file.write_bytes((b"# none\n" if text else bytes(8)) if damage == "empty" else data[: len(data) - 25])
     said: list[str] = []
-    points = sparse_points(sparse_file(tmp_path), said.append)
+    points = read_sparse_points(find_sparse_file(tmp_path), said.append)
     assert points is None or (damage == "cut" and text)
     assert points is not None or (len(said) == 1 and ("points3D" in said[0] or "sparse" in said[0]))
 
@@ -348,7 +348,7 @@ def test_points_that_cannot_be_used_are_a_warning(tmp_path: Path, damage: str, t
 def test_named_points_that_cannot_be_used_are_a_warning(tmp_path: Path, name: str) -> None:
     path = captured(tmp_path, NAMES, ply_file_path=name)
     said: list[str] = []
-    assert sparse_points(sparse_file(path), said.append) is None
+    assert read_sparse_points(find_sparse_file(path), said.append) is None
     assert len(said) == 1
     assert Path(name).name in said[0]
 
@@ -357,7 +357,7 @@ def test_points_named_on_another_machine(tmp_path: Path) -> None:
     path = captured(tmp_path, NAMES, ply_file_path="C:\\capture\\cloud\\p.ply")
     (tmp_path / "cloud").mkdir()
     (tmp_path / "cloud" / "p.ply").write_bytes(b"ply")
-    assert sparse_file(path) == tmp_path / "cloud" / "p.ply"
+    assert find_sparse_file(path) == tmp_path / "cloud" / "p.ply"
 
 
 def _made(path: Path) -> Path:
@@ -370,6 +370,6 @@ def test_named_points_without_colours_are_taken(tmp_path: Path) -> None:
     path = captured(tmp_path, NAMES, ply_file_path="bare.ply")
     head = "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\n"
     (tmp_path / "bare.ply").write_text(f"{head}end_header\n0 0 0\n")
-    cloud = sparse_points(sparse_file(path))
+    cloud = read_sparse_points(find_sparse_file(path))
     assert cloud is not None
     assert cloud.colored.tolist() == [False]

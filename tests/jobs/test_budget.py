@@ -16,10 +16,10 @@ from g2ard.jobs.budget import DEVICES, LAYERS, Budget
 from g2ard.jobs.budget_search import (
     Quality,
     ResolvedBudget,
-    clipped_images,
-    count_for_bytes,
-    count_for_quality,
-    file_bytes,
+    find_count_for_bytes,
+    find_count_for_quality,
+    measure_file,
+    render_clipped,
 )
 from g2ard.jobs.close_up import close_up
 from g2ard.jobs.distill import prepare
@@ -38,7 +38,7 @@ def fast(splats: Splats, count: int) -> Splats:
 
 def test_bytes_too_few_for_a_gaussian_in_tiles() -> None:
     with pytest.raises(InputError, match=r"a\.ply: 100 bytes are too few"):
-        count_for_bytes(checkered_ball(9), 100, "a.ply", partial(fast, checkered_ball(9)), total=6000)
+        find_count_for_bytes(checkered_ball(9), 100, "a.ply", partial(fast, checkered_ball(9)), total=6000)
 
 
 def test_a_small_file_of_a_format_with_a_head_takes_few_trials() -> None:
@@ -48,8 +48,8 @@ def test_a_small_file_of_a_format_with_a_head_takes_few_trials() -> None:
         tried.append(count)
         return fast(scene, count)
 
-    count = count_for_bytes(scene, 20_000, "a.sog", reduce)
-    assert 0.97 * 20_000 < file_bytes(fast(scene, count), "a.sog") <= 20_000
+    count = find_count_for_bytes(scene, 20_000, "a.sog", reduce)
+    assert 0.97 * 20_000 < measure_file(fast(scene, count), "a.sog") <= 20_000
     assert len(tried) <= 6
 
 
@@ -65,26 +65,26 @@ def test_a_file_that_fills_nearly_all_bytes_ends_the_search(monkeypatch: pytest.
             tried.append(count)
             return checkered_ball(count)
 
-        monkeypatch.setattr("g2ard.jobs.budget_search.file_bytes", size)
-        assert count_for_bytes(checkered_ball(40_000), 10_000, "a.sog", reduce) > 0
+        monkeypatch.setattr("g2ard.jobs.budget_search.measure_file", size)
+        assert find_count_for_bytes(checkered_ball(40_000), 10_000, "a.sog", reduce) > 0
         assert len(tried) == last, most
 
 
 @pytest.mark.parametrize("name", ["a.ply", "a.SOG", "a.spz", "a.compressed.ply", "x/meta.json"])
 def test_the_count_fills_the_bytes(name: str) -> None:
     scene = checkered_ball(6000)
-    whole = file_bytes(scene, name)
-    count = count_for_bytes(scene, whole // 3, name, partial(fast, scene))
-    got = file_bytes(fast(scene, count), name)
+    whole = measure_file(scene, name)
+    count = find_count_for_bytes(scene, whole // 3, name, partial(fast, scene))
+    got = measure_file(fast(scene, count), name)
     assert 0.9 * whole / 3 < got <= whole // 3
-    assert count_for_bytes(scene, 2 * whole, name, partial(fast, scene)) == 6000
+    assert find_count_for_bytes(scene, 2 * whole, name, partial(fast, scene)) == 6000
     with pytest.raises(InputError, match="bytes are too few"):
-        count_for_bytes(scene, 900, name, partial(fast, scene))
+        find_count_for_bytes(scene, 900, name, partial(fast, scene))
 
 
 def test_the_count_keeps_the_quality() -> None:
     scene, views = checkered_ball(4000), around(6)
-    dense, counts, looked = (clipped_images(scene, views), 4000), [], []
+    dense, counts, looked = (render_clipped(scene, views), 4000), [], []
 
     def reduce(count: int) -> Splats:
         looked.append(count)
@@ -92,19 +92,21 @@ def test_the_count_keeps_the_quality() -> None:
 
     for wanted in (Quality(22, 0), Quality(26, 0), Quality(0, 0.9), Quality(22, 0.9)):
         looked.clear()
-        count, found = count_for_quality(*dense, wanted, views, reduce)
+        count, found = find_count_for_quality(*dense, wanted, views, reduce)
         assert found.meets(wanted)
         assert found.over(wanted) < 0.3
         assert len(looked) <= 8
         counts.append(count)
     assert counts[0] < counts[1]
     assert counts[3] == max(counts[0], counts[2])
-    assert count_for_quality(*dense, Quality(200, 0), views, reduce)[0] == 4000
+    assert find_count_for_quality(*dense, Quality(200, 0), views, reduce)[0] == 4000
     looked.clear()
-    count, found = count_for_quality(*dense, Quality(41, 0), views, reduce)  # far above what a quarter keeps
+    count, found = find_count_for_quality(
+        *dense, Quality(41, 0), views, reduce
+    )  # far above what a quarter keeps
     assert 2000 < count < 4000
     assert found.psnr >= 41
-    assert count_for_quality(*dense, Quality(1, 0), views, reduce)[0] == 64
+    assert find_count_for_quality(*dense, Quality(1, 0), views, reduce)[0] == 64
 
 
 def test_simplify_fits(tmp_path: Path, command_line: CommandLine) -> None:
@@ -123,18 +125,18 @@ def test_simplify_fits(tmp_path: Path, command_line: CommandLine) -> None:
 def test_quest3_bounds_overdraw(recovered: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     scene, said = checkered_ball(6000), []
     reduce = Reduction(InMemory(scene), blind=True, recovered=recovered, say=said.append)
-    plain = reduce.resolved(Budget(fit="quest3"), "a", "a.ply")
-    assert plain.count == reduce.resolved(Budget(fit="web"), "a", "a.ply").count == 6000
+    plain = reduce.resolve(Budget(fit="quest3"), "a", "a.ply")
+    assert plain.count == reduce.resolve(Budget(fit="web"), "a", "a.ply").count == 6000
     dense = close_up(scene)
     assert dense is not None
     monkeypatch.setitem(LAYERS, "quest3", dense["mean"] / 1.3)
-    found = reduce.resolved(Budget(fit="Quest3"), "a", "a.ply").count
+    found = reduce.resolve(Budget(fit="Quest3"), "a", "a.ply").count
     near = close_up(fast(scene, found) if recovered else reduce(found).splats)
     assert near is not None
     assert dense["mean"] / 4 < near["mean"] <= dense["mean"] / 1.3
     assert f"at {found:,}" in " ".join(said)
     monkeypatch.setitem(LAYERS, "quest3", 1e-3)  # out of reach: the search ends, and says what it has
-    assert reduce.resolved(Budget(fit="quest3"), "a", "a.ply").count < found
+    assert reduce.resolve(Budget(fit="quest3"), "a", "a.ply").count < found
 
 
 @pytest.mark.parametrize(
@@ -154,9 +156,9 @@ def test_distill_measures_the_simplification_that_it_makes(settings: dict[str, A
 
 def test_a_result_that_is_too_large_is_merged_further() -> None:
     first, said = fast(checkered_ball(3000), 1000), []
-    most = file_bytes(first, "a.ply") // 2
+    most = measure_file(first, "a.ply") // 2
     small = ResolvedBudget(1000, bytes=most, file="a.ply").shrink(first, said.append)
-    assert file_bytes(small, "a.ply") <= most
+    assert measure_file(small, "a.ply") <= most
     assert 0.9 * 500 < len(small) < 510
     assert "merging 1,000 to " in said[0]
 
@@ -172,7 +174,7 @@ def test_bytes_are_of_the_degree_that_is_written() -> None:
     small = g2ard.distill(scene, fit="300kB", sh_degree=3, steps=3, say=said.append, **given)
     assert small.splats.sh_degree == 3
     assert not [line for line in said if "bytes are too many" in line]
-    assert 0.95 * 300_000 < file_bytes(small.splats, "a.ply") <= 300_000
+    assert 0.95 * 300_000 < measure_file(small.splats, "a.ply") <= 300_000
 
 
 def test_decibels_are_of_the_file(tmp_path: Path, command_line: CommandLine) -> None:

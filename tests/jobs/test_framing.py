@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import ArrayLike
 
-from g2ard.jobs.framing import fields_of
+from g2ard.jobs.framing import choose_fields
 from g2ard.scene.cameras import Camera, Cameras
 from g2ard.scene.splats import Splats
 from helpers.pages import half_height as half
@@ -40,7 +40,7 @@ def test_a_subject_fills_the_window(size: tuple[float, float], aspect: float) ->
     view = Camera.facing([0, -1, 0], [0, 0, 0], width=400, height=300, fov=80)
     flat = np.random.default_rng(0).uniform(-1, 1, (4000, 2)) * size
     points = np.insert(flat, 1, 0.0, axis=1)
-    tall = half(fields_of(view, subject=points), aspect)
+    tall = half(choose_fields(view, subject=points), aspect)
     used = max(size[0] / (tall * aspect), size[1] / tall)
     assert 0.85 < used < 1
 
@@ -48,15 +48,15 @@ def test_a_subject_fills_the_window(size: tuple[float, float], aspect: float) ->
 @pytest.mark.parametrize("aspect", ASPECTS)
 def test_all_of_a_view_fits_into_the_window(aspect: float) -> None:
     view = Camera.facing([0, -1, 0], [0, 0, 0], width=400, height=300, fov=2 * np.degrees(np.arctan(0.4)))
-    tall = half(fields_of(view), aspect)
+    tall = half(choose_fields(view), aspect)
     assert max(0.4 / (tall * aspect), 0.3 / tall) == pytest.approx(1)
 
 
 @pytest.mark.parametrize("aspect", ASPECTS)
 def test_what_no_photo_saw_is_outside(aspect: float) -> None:
     views, scene = photos(), wall(-4, 4, -4, 4)
-    tall = half(fields_of(views[2], scene=scene, cameras=views), aspect)
-    whole = half(fields_of(views[2]), aspect)
+    tall = half(choose_fields(views[2], scene=scene, cameras=views), aspect)
+    whole = half(choose_fields(views[2]), aspect)
     seen = min(1, 0.42 / (tall * aspect)) * min(1, 0.8 / tall)
     assert seen > 0.9
     assert tall <= whole * 1.001
@@ -66,12 +66,12 @@ def test_what_no_photo_saw_is_outside(aspect: float) -> None:
 @pytest.mark.parametrize("aspect", ASPECTS[1:])  # a phone shows more above and below than any photo
 def test_what_other_photos_saw_may_be_shown(aspect: float) -> None:
     views = photos(0.1 * np.arange(-40, 41))
-    fields = fields_of(views[40], scene=wall(-4, 4), cameras=views)
-    assert half(fields, aspect) == pytest.approx(half(fields_of(views[40]), aspect), rel=0.01)
+    fields = choose_fields(views[40], scene=wall(-4, 4), cameras=views)
+    assert half(fields, aspect) == pytest.approx(half(choose_fields(views[40]), aspect), rel=0.01)
 
 
 @pytest.mark.parametrize("aspect", ASPECTS)
 def test_photos_of_an_object_before_nothing_keep_what_is_empty(aspect: float) -> None:
     views, scene = photos(), wall(-0.2, 0.2, -0.4, 0.4)
-    fields = fields_of(views[2], scene=scene, cameras=views)
-    assert half(fields, aspect) == pytest.approx(half(fields_of(views[2]), aspect), rel=0.01)
+    fields = choose_fields(views[2], scene=scene, cameras=views)
+    assert half(fields, aspect) == pytest.approx(half(choose_fields(views[2]), aspect), rel=0.01)

@@ -11,9 +11,9 @@ from PIL import Image
 from g2ard.io import write_views
 from g2ard.io.types import ViewSet
 from g2ard.jobs.distill_options import DistillOptions
-from g2ard.jobs.run_views import _twice, views_of
+from g2ard.jobs.run_views import _double_size, choose_views
 from g2ard.pipeline.dense import InMemory
-from g2ard.pipeline.distill import RunViews, draw_weights
+from g2ard.pipeline.distill import RunViews, choose_draw_weights
 from g2ard.poses import plan_pool
 from g2ard.rendering.visibility import visibility_source
 from g2ard.scene.cameras import Cameras, rows_by_kind
@@ -62,7 +62,7 @@ def test_views_are_made_where_none_are_given(command_line: CommandLine, folder: 
 def test_views_of_other_kinds_join_the_usual_ones(make, focus: str | None, kinds: set[str]) -> None:
     scene = make()
     options = DistillOptions(views="made", settings={"focus": focus, "schedule": "best"})
-    views = views_of(InMemory(scene), options, len(scene) // 10)
+    views = choose_views(InMemory(scene), options, len(scene) // 10)
     rows = rows_by_kind(views.train.cameras.kinds)
     assert set(rows) <= kinds
     assert len(rows["usual"]) == (224 if make is naive.room else 112)
@@ -88,7 +88,9 @@ def test_runs_with_a_focus_are_scored_in_the_views_of_others(focus: str) -> None
     """So their scores can be compared, and none of the views trains the other run."""
     statue = naive.statue()
     plain, focused = (
-        views_of(InMemory(statue), DistillOptions(views="made", settings={"focus": kind, "steps": 1400}), 300)
+        choose_views(
+            InMemory(statue), DistillOptions(views="made", settings={"focus": kind, "steps": 1400}), 300
+        )
         for kind in (None, focus)
     )
     np.testing.assert_array_equal(focused.test.viewmats, plain.test.viewmats)
@@ -121,7 +123,7 @@ def test_given_views_stay_first(tmp_path: Path) -> None:
     statue = naive.statue()
     write_views(tmp_path / "views.json", plan_pool(statue, 16).cameras)
     views = [
-        views_of(InMemory(statue), DistillOptions(views=tmp_path / "views.json", settings=settings), 500)
+        choose_views(InMemory(statue), DistillOptions(views=tmp_path / "views.json", settings=settings), 500)
         for settings in ({"focus": "far"}, {"focus": "anywhere", "focus_share": 0.25})
     ]
     plain, mixed = (found.train.cameras for found in views)
@@ -145,14 +147,14 @@ def test_crowded_views_have_their_weights_whatever_joins(crowded: int, focus: st
 
     def found(focus: str | None, **settings: object) -> ViewSet:
         views = ViewSet(given, splits=("train",) * (len(given) - 1) + ("test",))
-        return views_of(
+        return choose_views(
             InMemory(room), DistillOptions(views=views, settings={"focus": focus, **settings}), 300
         ).train
 
     alone, mixed = found("far"), found(focus)
     usual = len(alone.cameras)
     assert len(mixed.cameras) > usual or focus is None
-    expected = draw_weights(room, alone, DistillOptions().config)
+    expected = choose_draw_weights(room, alone, DistillOptions().config)
     assert expected is not None
     own = mixed.weights if mixed.weights is not None else expected
     np.testing.assert_allclose(own[:usual], expected / expected.mean(), rtol=1e-9)
@@ -168,7 +170,7 @@ def test_runs_of_few_steps_use_few_views() -> None:
     scene = naive.statue()
 
     def made(**recover: object) -> RunViews:
-        return views_of(InMemory(scene), DistillOptions(views="made", settings=recover), len(scene) // 10)
+        return choose_views(InMemory(scene), DistillOptions(views="made", settings=recover), len(scene) // 10)
 
     whole, fast, few = made(schedule="best"), made(schedule="fast"), made(steps=20)
     counts = [len(views.train.cameras) for views in (whole, fast, few)]
@@ -193,7 +195,7 @@ def test_a_few_views_are_scored_at_twice_their_size(command_line: CommandLine, f
 @pytest.mark.parametrize(("side", "some"), [(1200, True), (1201, False)])
 def test_very_large_views_are_not_scored_at_twice_their_size(side: int, some: bool) -> None:
     """Twice 1,200 pixels is the most: a score of larger ones would take longer than the run."""
-    found = _twice(around(9, (side, 40)), 3)
+    found = _double_size(around(9, (side, 40)), 3)
     assert (found is not None) == some
     if found is not None:
         assert {*found.widths.tolist()} == {2 * side}

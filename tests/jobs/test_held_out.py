@@ -17,7 +17,7 @@ from g2ard.io.colmap import texts_of
 from g2ard.io.images import write_png
 from g2ard.io.types import Points
 from g2ard.jobs.budget import Budget
-from g2ard.jobs.distill import preparing
+from g2ard.jobs.distill import open_job
 from g2ard.jobs.distill_options import DistillOptions
 from g2ard.jobs.tile_options import Tiling
 from helpers.photos import photographed
@@ -247,6 +247,6 @@ def test_points_in_tiles_are_those_that_training_photos_found(tmp_path: Path) ->
         (points.parent / "test.txt").write_text("\n".join(f"{name}.png" for name in names_of(HELD_OUT)))
         options = DistillOptions(views=folder, settings={"steps": 3})
         tiling = Tiling(100, workers=1, folder=folder / "work")
-        with preparing(Source(points), Budget(count=90), options, tiling) as job:
+        with open_job(Source(points), Budget(count=90), options, tiling) as job:
             found.append(job.run().splats)
     assert_same_bits(*found)

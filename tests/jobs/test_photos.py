@@ -17,7 +17,7 @@ from g2ard.io.types import Points
 from g2ard.jobs.budget import Budget
 from g2ard.jobs.distill import prepare
 from g2ard.jobs.distill_options import DistillOptions
-from g2ard.jobs.start_points import topped_up, usual_count
+from g2ard.jobs.start_points import choose_count, top_up_points
 from g2ard.progress import silent, unsaid
 from g2ard.stages.photo_points.hull import visual_hull
 from g2ard.stages.photo_points.rays import distinct, points_along_rays
@@ -80,7 +80,7 @@ def test_points_of_photos_are_at_as_many_places_as_asked(repeated: int, tmp_path
         spots = np.random.default_rng(1).normal(size=(500, 3))
         spots = np.concatenate([spots, spots[:repeated]])
         points = distinct(Points(spots, np.full((len(spots), 3), 0.5, np.float32)))
-    found = topped_up(
+    found = top_up_points(
         points,
         cameras,
         2_000,  # of 73,728 pixels, so that some are drawn twice
@@ -213,4 +213,4 @@ def test_no_count_is_above_its_limit_but_for_sparse_points(
     monkeypatch.setattr("g2ard.jobs.start_points._MOST_USUAL_COUNT", 50)
     train = g2ard.load_views(tmp_path / "photos", split="train")
     for sparse, expected in ((0, 50), (70, 70)):
-        assert usual_count(train, None, sparse, unsaid) == expected
+        assert choose_count(train, None, sparse, unsaid) == expected

@@ -65,7 +65,7 @@ def test_few_gaussians_are_too_little_to_reject_photos(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     photos, said = photographed(tmp_path, BALL, VIEWS), []
-    monkeypatch.setattr(view_checks, "_likeness", lambda *_: ([0.1] * 12, [0.65] * 12))
+    monkeypatch.setattr(view_checks, "_compare_photos", lambda *_: ([0.1] * 12, [0.65] * 12))
     check_photos(BALL.take(range(999)), photos, (0, 0, 0), said.append)
     assert "does not look like the photos (correlation 0.10)" in said[0]
     with pytest.raises(InputError, match="the photos do not show the scene"):

@@ -56,16 +56,20 @@ def test_a_generated_pool_is_completed_for_the_student(folder: Path) -> None:
     kinds = job.targets.train.cameras.kinds
     assert kinds.count("usual") == 112
     assert {"usual"} < set(kinds)
-    assert job.validation is not None
-    assert "usual" not in job.validation.cameras.kinds
+    assert job.targets.validation is not None
+    assert "usual" not in job.targets.validation.cameras.kinds
     assert job.held_out is not None
     assert job.held_out.cameras.kinds.count("usual") == 16
-    assert set(job.validation.cameras.kinds) <= set(job.held_out.cameras.kinds)
+    assert set(job.targets.validation.cameras.kinds) <= set(job.held_out.cameras.kinds)
     assert job.config.steps == count_steps_for_renders(student, job.targets.train.cameras, 800)
-    names = [*job.targets.train.cameras.names, *job.validation.cameras.names, *job.held_out.cameras.names]
+    names = [
+        *job.targets.train.cameras.names,
+        *job.targets.validation.cameras.names,
+        *job.held_out.cameras.names,
+    ]
     assert len(set(names)) == len(names)
     given = prepare(student, views=job.targets.views.train, teacher=naive.statue(), size=32)
-    assert given.validation is None
+    assert given.targets.validation is None
 
 
 @pytest.mark.parametrize(

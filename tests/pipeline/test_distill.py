@@ -135,12 +135,14 @@ def test_a_loss_in_any_kind_of_view_is_reported() -> None:
 
 
 def test_steps_by_need_are_for_teachers() -> None:
-    from g2ard.pipeline.distill import _recovery
+    from g2ard.pipeline.distill import _configure_recovery
 
     part = replace(around(12), Ks=around(12).Ks * [[[4], [4], [1]]])  # a sixteenth of the ball in each
 
     def horizon(targets: Targets, config: DistillConfig) -> int | None:
-        return _recovery(config.recover, PRIOR, targets.cameras, 1, of_photos=False, final=True).steps
+        return _configure_recovery(
+            config.recover, PRIOR, targets.cameras, 1, of_photos=False, final=True
+        ).steps
 
     teacher, config = (
         TeacherRenders(PRIOR, part, lazy=True),

@@ -263,10 +263,12 @@ def test_every_input_of_a_simplification_changes_its_key() -> None:
         "protected": np.zeros(40, bool),
     }
     kept = {"config": DistillConfig(), "progress": silent, "drawn": ()}
-    assert set(inspect.signature(distill._simplified).parameters) == {"steps", *given, *kept}
-    keys = [recorded(lambda own: distill._simplified(own, **given, **kept))]
+    assert set(inspect.signature(distill._simplify_round).parameters) == {"steps", *given, *kept}
+    keys = [recorded(lambda own: distill._simplify_round(own, **given, **kept))]
     for name, value in given.items():
         for other in others(value):
             changed = given | {name: other}
-            keys.append(recorded(lambda own, changed=changed: distill._simplified(own, **changed, **kept)))
+            keys.append(
+                recorded(lambda own, changed=changed: distill._simplify_round(own, **changed, **kept))
+            )
     assert len(set(keys)) == len(keys)

@@ -17,7 +17,7 @@ from g2ard.config.schema import changed
 from g2ard.pipeline.adapt import AdaptConfig, adapt
 from g2ard.pipeline.config import DistillConfig, SelectConfig
 from g2ard.pipeline.distill import distill
-from g2ard.pipeline.presets import configured
+from g2ard.pipeline.presets import configure
 from g2ard.rendering.targets import Photos, TeacherRenders
 from g2ard.scene.splats import ARRAYS
 from g2ard.stages.recover import checkpoint
@@ -92,7 +92,7 @@ def distillation(config: DistillConfig, **more: Any) -> Call:
 
 ROUNDS = replace(TUNED, steps=9, round_steps=5)
 PAPER = changed(
-    configured(DistillConfig(), "paper"),
+    configure(DistillConfig(), "paper"),
     {"recover.steps": 6, "recover.schedule.round_steps": 3, "simplify.iterations": 3},
 )
 

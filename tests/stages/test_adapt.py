@@ -14,10 +14,10 @@ from g2ard.pipeline.adapt import (
     AdaptConfig,
     _fit,
     adapt,
-    blended_appearance,
-    colour_change,
-    recoloured,
-    views_seeing,
+    blend_appearance,
+    count_views_seeing,
+    fit_colour_change,
+    recolour,
 )
 from g2ard.progress import silent
 from g2ard.rendering.renderer import render
@@ -137,11 +137,11 @@ def evening(count: int = 800):  # type: ignore[no-untyped-def]
 
 def test_a_change_of_light_is_found_and_made() -> None:
     ball, lit = evening()
-    change = colour_change(ball, TeacherRenders(lit, VIEWS, background=BACKGROUND), BACKGROUND)
+    change = fit_colour_change(ball, TeacherRenders(lit, VIEWS, background=BACKGROUND), BACKGROUND)
     np.testing.assert_allclose(change.matrix, MATRIX, atol=0.02)
     np.testing.assert_allclose(change.shift, SHIFT, atol=0.02)
     assert change.gain > 15
-    moved = recoloured(ball, change)
+    moved = recolour(ball, change)
     for view in (0, 7):
         got, want = (render(s, VIEWS[view], background=BACKGROUND).image for s in (moved, lit))
         np.testing.assert_allclose(got, want, atol=0.02)
@@ -149,7 +149,7 @@ def test_a_change_of_light_is_found_and_made() -> None:
 
 def test_an_unchanged_light_gives_the_identity() -> None:
     ball = checkered_ball(500)
-    change = colour_change(ball, TeacherRenders(ball, VIEWS), (0.0, 0.0, 0.0))
+    change = fit_colour_change(ball, TeacherRenders(ball, VIEWS), (0.0, 0.0, 0.0))
     np.testing.assert_allclose(change.matrix, np.eye(3), atol=1e-6)
     assert adapt(ball, TeacherRenders(ball, VIEWS), AdaptConfig(steps=5)).report.colour_change is None
 
@@ -165,13 +165,13 @@ def test_masked_pixels_are_ignored(tmp_path: Path) -> None:
             height, width = int(self.cameras.heights[view]), int(self.cameras.widths[view])
             return np.broadcast_to(np.arange(width) < width // 2, (height, width))
 
-    change = colour_change(ball, HalfBlack(lit, VIEWS), (0.0, 0.0, 0.0))
+    change = fit_colour_change(ball, HalfBlack(lit, VIEWS), (0.0, 0.0, 0.0))
     np.testing.assert_allclose(change.matrix, MATRIX, atol=0.03)
 
 
 def test_views_that_see_a_gaussian_are_counted() -> None:
     ball = checkered_ball(800)
-    all_round, one = views_seeing(ball, VIEWS), views_seeing(ball, VIEWS.take([0]))
+    all_round, one = count_views_seeing(ball, VIEWS), count_views_seeing(ball, VIEWS.take([0]))
     assert 0 <= one.min() <= one.max() < 1
     assert all_round.max() > 4
     eye = VIEWS.positions[0] / np.linalg.norm(VIEWS.positions[0])
@@ -182,7 +182,7 @@ def test_views_that_see_a_gaussian_are_counted() -> None:
 def test_a_blend_goes_its_share_of_the_way() -> None:
     ball, lit = evening(50)
     share = np.linspace(0, 1, 50)
-    mixed = blended_appearance(ball, lit, share)
+    mixed = blend_appearance(ball, lit, share)
     np.testing.assert_array_equal(mixed.sh0[0], ball.sh0[0])
     np.testing.assert_allclose(mixed.sh0[-1], lit.sh0[-1], atol=1e-6)
     want = ball.shN + share[:, None, None] * (lit.shN - ball.shN)

@@ -11,7 +11,7 @@ from g2ard import io
 from g2ard.errors import InputError
 from g2ard.io import Source, sog
 from g2ard.io.tile_store import TileStore
-from g2ard.jobs.levels import Levels, preparing_levels
+from g2ard.jobs.levels import Levels, open_levels
 from g2ard.jobs.tile_options import Tiling
 from g2ard.levels import Cut, cut, save_levels, tree
 from g2ard.progress import Say, unsaid
@@ -83,7 +83,7 @@ def levels_in_tiles(place: Path, folder: Path, say: Say = unsaid) -> Levels[Any]
     options: dict[str, Any] = {"ratios": (1, 3, 12), "recover": True, "steps": 30, "background": (0, 0, 0)}
     options |= {"split_sky": False, "seed": 0, "views": place / "views.json", "size": 64, "say": say}
     tiling = Tiling(tile_rows=850, workers=1, folder=folder)
-    with preparing_levels(Source(place / "town.ply"), tiling, **options) as job:
+    with open_levels(Source(place / "town.ply"), tiling, **options) as job:
         return job.run()
 
 

@@ -13,8 +13,8 @@ from g2ard.jobs.memory import (
     LEVELS_TIMES,
     RECOVERY_TIMES,
     TileMemory,
-    bytes_of,
     check_whole_memory,
+    parse_bytes,
     plan_tiles,
 )
 from g2ard.jobs.tile_options import Tiling
@@ -41,7 +41,7 @@ def tiles(scene: Path, folder: Path, rows: int) -> TileStore:
 
 @pytest.mark.parametrize("memory", ["201600kB", "202MB", "203MB"])
 def test_tiles_that_are_advised_fit(scene: Path, tmp_path: Path, memory: str) -> None:
-    size = bytes_of(memory)
+    size = parse_bytes(memory)
     with pytest.raises(
         InputError, match=r"in one piece take about 20[4-9] MB, 200 MB of it the program"
     ) as e:
@@ -67,13 +67,13 @@ def test_an_error_names_the_least_memory_that_works(scene: Path, tmp_path: Path)
         told = re.search(r"tiles take is about (\d+) MB, with --tile-rows 1,000$", str(e.value))
         assert told, e.value
         least = tiles(scene, tmp_path / told[1], 1000)
-        assert plan_tiles(least, Tiling(memory=bytes_of(f"{told[1]}MB")), RECOVERY_TIMES).workers == 1
+        assert plan_tiles(least, Tiling(memory=parse_bytes(f"{told[1]}MB")), RECOVERY_TIMES).workers == 1
 
 
 def test_tiles_of_a_folder_are_not_cut_anew(scene: Path, tmp_path: Path) -> None:
     store = tiles(scene, tmp_path, 6000)
     with pytest.raises(InputError, match=r"; `g2ard ingest \S+tiles -o DIR --tile-rows [\d,]+` takes less"):
-        plan_tiles(store, Tiling(memory=bytes_of("202MB"), folder=tmp_path / ".x.tiles"))
+        plan_tiles(store, Tiling(memory=parse_bytes("202MB"), folder=tmp_path / ".x.tiles"))
 
 
 def test_the_machines_memory_is_the_default(

@@ -16,7 +16,7 @@ import g2ard._core as _core
 from g2ard.errors import InputError
 from g2ard.io import read_splats, write_splats
 from g2ard.io.tile_store import TileStore
-from g2ard.pipeline.dense import whole as in_memory
+from g2ard.pipeline.dense import load_whole as in_memory
 from g2ard.progress import silent
 from g2ard.rendering.renderer import RasterSettings
 from g2ard.rendering.targets import TeacherRenders
@@ -364,7 +364,7 @@ def test_a_floor_in_tiles_stays_as_closed_as_in_one_piece(tmp_path: Path, seen: 
     def tiled(config: SimplifyConfig, *, gaps: bool) -> tuple[Splats, float | None]:
         with executor(threads=1) as runs:
             tiles = InTiles(store, Workers(runs, tmp_path / "work", silent), config, 1500, tmp_path)
-            done = tiles.merged(250, views, config, gaps=gaps)
+            done = tiles.merge(250, views, config, gaps=gaps)
             return in_memory(done.splats), done.report.opacity_lost
 
     source = None if views is None else visibility_source(views)

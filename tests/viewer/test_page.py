@@ -22,7 +22,7 @@ from g2ard.io import Source, read_splats, write_splats, write_views
 from g2ard.io.types import ViewSet
 from g2ard.jobs import budget
 from g2ard.jobs.inputs import GivenViews
-from g2ard.jobs.viewer_frame import frame_of, frame_with
+from g2ard.jobs.viewer_frame import choose_frame, place_frame
 from g2ard.pipeline.distill import RunViews
 from g2ard.scene.cameras import Camera, Cameras
 from g2ard.scene.splats import Splats
@@ -168,7 +168,7 @@ def test_the_start_shows_what_the_view_shows(seed: int) -> None:
     )
     eye = offset + 3 * rng.normal(size=3)
     camera = Camera.facing(eye, offset, width=size[0], height=size[1], fov=50, up=up)
-    stand = frame_with(scene, Cameras.of([camera]), up=tuple(up), start=camera.name)
+    stand = place_frame(scene, Cameras.of([camera]), up=tuple(up), start=camera.name)
     here = stand.of(scene)
     assert not here.offset.any()
     assert np.allclose(stand.up, up / np.linalg.norm(up))
@@ -184,9 +184,9 @@ def test_the_start_shows_what_the_view_shows(seed: int) -> None:
 def test_level_views_tell_up_and_a_single_one_does_not() -> None:
     ball = checkered_ball(400)
     views = around(12)  # all level with z
-    stand = frame_with(ball, views)
+    stand = place_frame(ball, views)
     assert np.allclose(stand.up, [0, 0, 1], atol=1e-6)
-    alone = frame_with(ball, views.take([5]))
+    alone = place_frame(ball, views.take([5]))
     assert np.linalg.norm(alone.up) == pytest.approx(1)
     assert alone.name == "view_005"
 
@@ -196,7 +196,7 @@ def test_drones_that_look_straight_down_are_above() -> None:
     for k, turn in enumerate(np.linspace(0, 2 * np.pi, 9)[:-1]):
         top = np.array([np.cos(turn), np.sin(turn), 0])
         views.append(Camera.facing([k, 1, 5], [k, 1, 0] - 0.1 * top, up=top, name=str(k)))
-    assert np.allclose(frame_with(checkered_ball(400), Cameras.of(views)).up, [0, 0, 1], atol=1e-6)
+    assert np.allclose(place_frame(checkered_ball(400), Cameras.of(views)).up, [0, 0, 1], atol=1e-6)
 
 
 def test_photos_that_all_face_one_way_tell_up() -> None:
@@ -206,7 +206,7 @@ def test_photos_that_all_face_one_way_tell_up() -> None:
         for k, tilt in enumerate(tilts)
     )
     photos = replace(views, image_paths=tuple(map(Path, views.names)))
-    assert np.allclose(frame_with(checkered_ball(400), photos).up, [0.6, 0, 0.8], atol=0.05)
+    assert np.allclose(place_frame(checkered_ball(400), photos).up, [0.6, 0, 0.8], atol=0.05)
 
 
 def test_a_page_starts_at_a_typical_view_with_detail_or_the_one_named() -> None:
@@ -221,25 +221,27 @@ def test_a_page_starts_at_a_typical_view_with_detail_or_the_one_named() -> None:
         for turn in np.linspace(0, 6, 12)
     ]
     views = Cameras.of([away, below, close, *ring])
-    opened = views[views.names.index(str(frame_with(scene, views).name))]
+    opened = views[views.names.index(str(place_frame(scene, views).name))]
     assert opened.name.startswith("pose_")
     assert opened.position[1] < -2
-    assert frame_with(ball, views, start="below").name == "below"
-    assert frame_with(ball, views, start="away").start is not None  # sees nothing, and may still be asked for
+    assert place_frame(ball, views, start="below").name == "below"
+    assert (
+        place_frame(ball, views, start="away").start is not None
+    )  # sees nothing, and may still be asked for
     with pytest.raises(InputError, match="no view 'far'"):
-        frame_with(ball, views, start="far")
+        place_frame(ball, views, start="far")
 
 
 def test_a_scene_without_views_is_looked_at_from_around_and_one_without_room_as_a_whole() -> None:
     said: list[str] = []
-    stand = frame_of(checkered_ball(500), GivenViews(), say=said.append)
+    stand = choose_frame(checkered_ball(500), GivenViews(), say=said.append)
     assert stand.name
     assert stand.name == "view_0000"
     nothing = Splats.create([[0, 0, 0]], scales=[[1, 1, 1]], logit_opacities=[-20])
-    assert frame_of(nothing, GivenViews(), say=said.append).start is None
+    assert choose_frame(nothing, GivenViews(), say=said.append).start is None
     assert "no pose to start at" in said[-1]
     with pytest.raises(InputError):
-        frame_of(nothing, GivenViews(), start="pose_0000")
+        choose_frame(nothing, GivenViews(), start="pose_0000")
 
 
 def test_a_run_has_a_page_unless_too_large(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -300,7 +302,7 @@ def test_a_page_opens_with_the_whole_subject_in_sight(height: float) -> None:
         scales=np.full((3000, 3), 0.05),
         logit_opacities=np.full(3000, 4.0),
     )
-    stand = frame_with(tall, None, up=(0, -1, 0))
+    stand = place_frame(tall, None, up=(0, -1, 0))
     assert stand.start is not None
     eye, target = (stand.world(point) for point in (stand.start.position, stand.start.target))
     _, vertical = stand.start.fov[-1]

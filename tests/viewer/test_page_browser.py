@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from g2ard.io import write_splats
-from g2ard.jobs.view_checks import opaque_points
-from g2ard.jobs.viewer_frame import frame_with
+from g2ard.jobs.view_checks import sample_opaque_points
+from g2ard.jobs.viewer_frame import place_frame
 from g2ard.rendering.metrics import psnr
 from g2ard.rendering.renderer import Renderer
 from g2ard.scene.cameras import Camera, Cameras
@@ -35,7 +35,7 @@ def browser(page: Browser) -> Browser:
 
 def save(path: Path, *scenes: Splats, camera: Camera = FRONT, up: tuple[float, ...] = (0, 0, 1)) -> Path:
     """A page of scenes that opens with a camera."""
-    stand = frame_with(scenes[0], Cameras.of([camera]), up=up, start=camera.name)
+    stand = place_frame(scenes[0], Cameras.of([camera]), up=up, start=camera.name)
     shown = [(f"scene {index}", stand.of(scene)) for index, scene in enumerate(scenes)]
     write_page(path, shown, start=stand.start, background=GREY, overwrite=True)
     return path
@@ -80,7 +80,7 @@ def test_an_antialiased_scene_is_drawn_as_such(browser: Browser, tmp_path: Path)
 def test_the_viewer_reads_the_files_we_write(browser: Browser, tmp_path: Path, suffix: str) -> None:
     scene = scattered()
     page = save(tmp_path / "page.html", scene)
-    stand = frame_with(scene, Cameras.of([FRONT]), up=(0, 0, 1), start="front")
+    stand = place_frame(scene, Cameras.of([FRONT]), up=(0, 0, 1), start="front")
     write_splats(tmp_path / f"other{suffix}", stand.of(scene))
     text = page.read_text(encoding="utf-8").replace("scene0.sog", f"scene0{suffix}")
     other = base64.b64encode((tmp_path / f"other{suffix}").read_bytes()).decode()
@@ -131,7 +131,10 @@ def test_both_scenes_share_a_camera(browser: Browser, tmp_path: Path) -> None:
 def test_arrows_lead_to_the_next_stop(browser: Browser, tmp_path: Path) -> None:
     scene = scattered()
     other = Camera.facing([-1.5, -1.6, 1.2], [0.1, 0, 0], width=WIDTH, height=HEIGHT, fov=40)
-    stand, points = frame_with(scene, Cameras.of([FRONT]), up=(0, 0, 1), start="front"), opaque_points(scene)
+    stand, points = (
+        place_frame(scene, Cameras.of([FRONT]), up=(0, 0, 1), start="front"),
+        sample_opaque_points(scene),
+    )
     stops = [(name, stand.start_at(view, points)) for name, view in (("typical", FRONT), ("worst", other))]
     page = tmp_path / "stops.html"
     write_page(page, [("scene", stand.of(scene))], start=stand.start, stops=stops, background=GREY)
@@ -171,7 +174,7 @@ def test_a_window_of_any_shape_shows_the_whole_view(
 
 def test_a_narrow_page_opens_readable_and_shows_each_scene_alone(tmp_path: Path) -> None:
     scene = scattered(400)
-    stand = frame_with(scene, Cameras.of([FRONT]), up=(0, 0, 1))
+    stand = place_frame(scene, Cameras.of([FRONT]), up=(0, 0, 1))
     names = ["a_scene_with_a_long_name.ply: 1,234,567 Gaussians", "another_long_name.ply: 12,345 Gaussians"]
     write_page(tmp_path / "two.html", [(name, stand.of(scene)) for name in names], start=stand.start)
     with Browser(390, 700) as page:
@@ -191,7 +194,7 @@ def test_a_narrow_page_opens_readable_and_shows_each_scene_alone(tmp_path: Path)
 
 def test_without_a_background_scenes_are_before_a_soft_gradient(browser: Browser, tmp_path: Path) -> None:
     scene = scattered()
-    stand = frame_with(scene, Cameras.of([FRONT]), up=(0, 0, 1), start="front")
+    stand = place_frame(scene, Cameras.of([FRONT]), up=(0, 0, 1), start="front")
     shown = [(name, stand.of(scene)) for name in ("left", "right")]
     image, alpha = layers(scene)
     for count in (1, 2):

@@ -9,7 +9,7 @@ import pytest
 
 from g2ard.jobs.inputs import GivenViews
 from g2ard.jobs.levels import save_tileset, write_level_page
-from g2ard.jobs.viewer_frame import frame_of
+from g2ard.jobs.viewer_frame import choose_frame
 from g2ard.levels import save_levels
 from g2ard.report.page import Page, Shown
 from g2ard.scene.splats import Splats
@@ -44,7 +44,7 @@ def column(count: int = 3000) -> Splats:
 
 def view_page(folder: Path, count: int = 1) -> str:
     scene = column()
-    stand = frame_of(scene, GivenViews(up=UP))
+    stand = choose_frame(scene, GivenViews(up=UP))
     shown = [(f"scene {index}", stand.of(scene)) for index in range(count)]
     write_page(folder / "view.html", shown, start=stand.start, background=GREY, overwrite=True)
     return "view.html"

@@ -12,7 +12,7 @@ from g2ard.cli.run import Run
 from g2ard.cli.run_result import tell_plan
 from g2ard.config.schema import listed
 from g2ard.io.scene_formats import check_positions
-from g2ard.pipeline.presets import configured
+from g2ard.pipeline.presets import configure
 from g2ard.progress import plural
 
 _FIELDS = "steps tolerance schedule prior_views sh_degree engine background seed"
@@ -53,7 +53,7 @@ def adapt(
     background = opt.background_of(run, background, compact)
     settings, _ = run.settle(AdaptConfig(), preset)
     opt.check_engine(settings.get("adapt.engine"))
-    config = configured(AdaptConfig(), preset or "auto", settings)
+    config = configure(AdaptConfig(), preset or "auto", settings)
     work = place_checkpoint(output, ".work")
     if not dry_run:
         check_scene_run(run, work, resume, output)
@@ -65,7 +65,7 @@ def adapt(
         dense,
         config.background,
         chosen=background is not None,
-        photos=photos,
+        insisted=photos,
         rough=dry_run,
         say=run.say,
     )
@@ -74,7 +74,7 @@ def adapt(
     count = len(targets.cameras)
     most = config.most_steps(count)
     first = config.stretches(count)[0]
-    cost = cost_of_recovery(splats, targets.cameras, most, teacher=dense)
+    cost = cost_of_recovery(splats, [targets.cameras], most, dense)
     if dry_run:
         tell_plan(run, len(splats), cost)
         return

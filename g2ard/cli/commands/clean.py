@@ -84,13 +84,13 @@ def clean(
 
     --preview FILE.png without -o shows what would go; --dry-run only estimates memory.
     """
+    from g2ard.jobs.clean import choose_kinds
     from g2ard.jobs.clean import clean as remove_clutter
-    from g2ard.jobs.clean import kinds_of
     from g2ard.jobs.cost import cost_of_cleaning
 
     kinds = None if only is None else tuple(word.strip() for word in only.split(",") if only != "none")
     with run.usage():
-        wanted = kinds_of(kinds, strength)
+        wanted = choose_kinds(kinds, strength)
     if preview is not None and kinds == ():
         raise typer.BadParameter("--preview shows clutter, so that it does not go with --only none")
     if output is None and (preview is None or split_sky is not None):
@@ -149,13 +149,13 @@ def _paint(path: Path, done: Cleaned, cameras: Cameras, overwrite: bool) -> None
     import numpy as np
 
     from g2ard.io.images import write_png
-    from g2ard.jobs.clean import painted
+    from g2ard.jobs.clean import paint
     from g2ard.rendering.renderer import Renderer
     from g2ard.report.sheet import draw_contact_sheet
     from g2ard.scene.samples import evenly_spaced
 
     colors = np.array([*(color for _, color in _COLORS.values()), _GREY])[done.clutter.kind]
-    scenes = [done.before, painted(done.before, colors), done.splats]
+    scenes = [done.before, paint(done.before, colors), done.splats]
     chosen = evenly_spaced(len(cameras), 3, floor=True)
     renderers = [Renderer(scene) for scene in scenes]
     rows = [[r.clipped(cameras[int(view)]) for r in renderers] for view in chosen]

@@ -10,7 +10,7 @@ import typer
 from g2ard.cli import options as opt
 from g2ard.cli.command import command
 from g2ard.cli.run import Run
-from g2ard.config.choices import BLACK, Colour, is_made
+from g2ard.config.choices import BLACK, Colour, is_given
 from g2ard.io import Source
 from g2ard.io.paths import real_path
 from g2ard.progress import plural
@@ -44,19 +44,19 @@ def compare(
     background: opt.BackgroundOption = None,
 ) -> None:
     """Compare renders of two scenes: PSNR, SSIM, the worst views, and a page to look at."""
-    from g2ard.jobs.comparison import dense_first, made_of_points
+    from g2ard.jobs.comparison import is_made_of_points, put_dense_first
     from g2ard.jobs.inputs import GivenViews, load_views
-    from g2ard.jobs.run_views import at_size, is_planned, planned_at, views_or_pool
-    from g2ard.jobs.view_checks import check_sight, opaque_points
-    from g2ard.jobs.viewer_frame import backdrop, best_level, frame_with, level_up
+    from g2ard.jobs.run_views import choose_plan_size, find_or_plan_views, is_planned, resize_views
+    from g2ard.jobs.view_checks import check_sight, sample_opaque_points
+    from g2ard.jobs.viewer_frame import choose_backdrop, choose_level_views, find_shared_up, place_frame
     from g2ard.rendering.targets import TeacherRenders
     from g2ard.scene.cameras import Cameras
     from g2ard.stages.evaluate import evaluate
     from g2ard.viewer.page import write_page
 
-    if views is not None and not is_made(views):
+    if is_given(views):
         run.refuse_typed("on given views", "looks")
-    (first, second), roles = dense_first(first, second)
+    (first, second), roles = put_dense_first(first, second)
     sources = [Source(path, run.render_model) for path in (first, second)]
     if output is not None:
         run.claim_file("--output", output, page=True)
@@ -64,13 +64,13 @@ def compare(
     known = opt.background_of(run, background, first, second)
     colour = known or BLACK
     given = opt.with_images(views, images)
-    found = views_or_pool(
+    found = find_or_plan_views(
         dense,
-        GivenViews(given, sources[0].file, None, run.seed, planned_at(size)),
+        GivenViews(given, sources[0].file, None, run.seed, choose_plan_size(size)),
         count=looks,
         **run.callbacks,
     )
-    cameras = at_size(load_views(found, "all", None, run.say), size, made=is_planned(found))
+    cameras = resize_views(load_views(found, "all", None, run.say), size, made=is_planned(found))
     check_sight(dense, cameras, run.say)
     targets = TeacherRenders(dense, cameras, background=colour, progress=run.progress)
     scores = evaluate(other, targets, background=colour, progress=run.progress)
@@ -92,16 +92,18 @@ def compare(
     )
     if output is not None:
         with run.showing("--output"):
-            points = opaque_points(dense)
+            points = sample_opaque_points(dense)
             if is_planned(found):  # generated views may show only parts
-                best = at_size(best_level(dense, 1, cameras, planned_at(size)), size, made=True)
+                best = resize_views(
+                    choose_level_views(dense, 1, cameras, choose_plan_size(size)), size, made=True
+                )
                 renders = TeacherRenders(dense, best, background=colour)
                 psnr[best.names[0]] = evaluate(other, renders, background=colour).psnr
-                axis = level_up(cameras)
-                stand = frame_with(dense, best, None if axis is None else axis.tolist())
+                axis = find_shared_up(cameras)
+                stand = place_frame(dense, best, None if axis is None else axis.tolist())
                 cameras = Cameras.of([*cameras, *best])
             else:
-                stand = frame_with(dense, cameras)
+                stand = place_frame(dense, cameras)
             shown = {"typical": str(stand.name)}
             for number, view in enumerate(worst, 1):
                 shown[f"worst {number}"] = view.name
@@ -116,7 +118,9 @@ def compare(
                 scenes,
                 start=stand.start,
                 stops=stops,
-                background=backdrop(known, [dense, other], of_points=made_of_points(first, sources[0])),
+                background=choose_backdrop(
+                    known, [dense, other], of_points=is_made_of_points(first, sources[0])
+                ),
                 overwrite=run.overwrite,
                 progress=run.progress,
             )
@@ -136,29 +140,29 @@ def _name_closer(
     Only runs know what they were made of.
     """
     from g2ard.errors import InputError
-    from g2ard.jobs.comparison import better_line, common_of, is_run, source_of
-    from g2ard.jobs.inputs import load_scene, load_views, scorable
+    from g2ard.jobs.comparison import describe_better, find_common, find_source, is_run
+    from g2ard.jobs.inputs import drop_unscorable, load_scene, load_views
     from g2ard.jobs.teaching import Teaching
     from g2ard.stages.evaluate import evaluate
 
-    if real_path(first) == source_of(second) or real_path(second) == source_of(first):
+    if real_path(first) == find_source(second) or real_path(second) == find_source(first):
         return None
     if not (is_run(first) and is_run(second)):
         both = f"{first} {second}"
         return f"to see which is closer to their dense scene: g2ard evaluate {both} --teacher DENSE"
     try:
-        common = common_of([first, second], background=True)
+        common = find_common([first, second], background=True)
     except InputError as error:
         return f"cannot say which is closer to their dense scene: {error}"
     assert common is not None
     source = None if common.teacher is None else load_scene(common.teacher, run.say)
-    teaching = Teaching.by(source, colour, chosen=True, photos=common.photos, say=run.say)
+    teaching = Teaching.by(source, colour, chosen=True, insisted=common.photos, say=run.say)
     cameras = load_views(common.views, "test", common.size, unpictured=source is not None)
     teaching.propose_background(cameras)
-    targets = scorable(teaching.targets(cameras, run.say))
+    targets = drop_unscorable(teaching.targets(cameras, run.say))
     scores = [
         evaluate(splats, targets, background=colour, progress=run.progress) for splats in (dense, other)
     ]
-    line = better_line(name_scenes([first, second]), scores, targets, "test")
+    line = describe_better(name_scenes([first, second]), scores, targets, "test")
     targets_of = "the photos" if common.teacher is None else str(common.teacher)
     return f"against {targets_of}, {line}"

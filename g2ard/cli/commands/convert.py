@@ -122,7 +122,7 @@ def convert(
     """
     from g2ard.io.scenes import write_table
     from g2ard.jobs.chosen_points import PointChoice
-    from g2ard.jobs.convert import Changes, opened_scenes, read_merged
+    from g2ard.jobs.convert import Changes, open_scenes, read_merged
 
     scenes, output = _part_paths(run, scenes, output)
     given = {"spz_version": spz_version, "compress": compress, "layout": layout}
@@ -130,7 +130,7 @@ def convert(
     if layout is not None and sh_degree not in (None, 3):
         raise typer.BadParameter("--layout inria has SH degree 3; leave --sh-degree out")
     matrix = None if transform is None else _read_matrix(transform)
-    opened = opened_scenes(scenes, run.render_model)
+    opened = open_scenes(scenes, run.render_model)
     points = None
     corners = None if box is None else numbers("--box", box, 6)
     with run.usage():

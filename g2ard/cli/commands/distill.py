@@ -13,7 +13,7 @@ from g2ard.cli.outputs import read_budget, refuse_file
 from g2ard.cli.run import Run
 from g2ard.cli.run_result import say_fit, tell_plan, tell_run
 from g2ard.cli.work_folder import drop_work, read_tiling, work_folder
-from g2ard.config.choices import is_made
+from g2ard.config.choices import is_given, is_made
 from g2ard.io import Source
 
 
@@ -96,16 +96,16 @@ def distill(
     """
     from g2ard.cli.run_folder import RunFolder
     from g2ard.jobs.cost import check_job_memory, cost_of
-    from g2ard.jobs.distill import preparing
+    from g2ard.jobs.distill import open_job
     from g2ard.jobs.distill_options import DistillOptions
-    from g2ard.jobs.scoring import best_targets, describe_run
+    from g2ard.jobs.scoring import choose_best_targets, describe_run
     from g2ard.jobs.tile_options import is_tiled
     from g2ard.pipeline.config import DistillConfig
     from g2ard.report.distilled import Drawn
 
     settings, _ = run.settle(DistillConfig(), preset)
     budget = read_budget(run, optional=scene is None)
-    given = views is not None and not is_made(views)
+    given = is_given(views)
     _check_options(scene, views, held_out, photos)
     if given:
         run.refuse_typed("on given views", "views_format")
@@ -143,7 +143,7 @@ def distill(
         say_fit(run, scene, budget, f"scene.{format}")
     written = None if dry_run else how
     held = work_folder(run, written, options.views, options.held_out, again=" with --resume")
-    with held, preparing(source, budget, options, how, planned=dry_run, **run.callbacks) as job:
+    with held, open_job(source, budget, options, how, planned=dry_run, **run.callbacks) as job:
         cost = cost_of(job, job.budget.count, page=page)
         if dry_run:
             tell_plan(run, job.budget.count, cost, job.plan)
@@ -156,7 +156,9 @@ def distill(
             drawn = None
             line = ""
             with run.showing("choosing views for report.html"):
-                drawn = Drawn(best_targets(job, done), list(filter(None, (done.held_out, job.targets.apart))))
+                drawn = Drawn(
+                    choose_best_targets(job, done), list(filter(None, (done.held_out, job.targets.apart)))
+                )
             with run.finishing("scoring"):
                 report = describe_run(job, done, folder.scene, drawn)
             if drawn is not None:

@@ -82,9 +82,9 @@ def evaluate(
     For the evaluation of the original 3DGS, use --convention inria --8bit --lpips-input unscaled.
     """
     from g2ard.io.describe import bytes_of
-    from g2ard.jobs.comparison import better_line, common_of
-    from g2ard.jobs.inputs import GivenViews, load_scene, load_views, scorable
-    from g2ard.jobs.run_views import shrunk, views_or_pool
+    from g2ard.jobs.comparison import describe_better, find_common
+    from g2ard.jobs.inputs import GivenViews, drop_unscorable, load_scene, load_views
+    from g2ard.jobs.run_views import find_or_plan_views, keep_larger
     from g2ard.jobs.teaching import Teaching, check_teacher
     from g2ard.jobs.view_checks import check_sight
     from g2ard.rendering.metrics import load_lpips
@@ -102,7 +102,7 @@ def evaluate(
         run.claim_file("--output", output, page=True)
     own = None
     if views is None and teacher is None:
-        own = common_of(scenes, background=background is not None)
+        own = find_common(scenes, background=background is not None)
     if own is not None:
         teacher = own.teacher
         photos = own.photos
@@ -120,16 +120,16 @@ def evaluate(
     frozen = run.load(anchors) if anchors else None
     dense = None if teacher is None else load_scene(teacher, run.say, run.render_model)
     teaching = Teaching.by(
-        dense, colour, chosen=chosen is not None, photos=photos, settings=settings, say=run.say
+        dense, colour, chosen=chosen is not None, insisted=photos, settings=settings, say=run.say
     )
     if dense is not None:
-        given = views_or_pool(dense, GivenViews(given, teacher, seed=run.seed), **run.callbacks)
+        given = find_or_plan_views(dense, GivenViews(given, teacher, seed=run.seed), **run.callbacks)
     assert given is not None  # `check_teacher`
     full = load_views(given, split, None, run.say, unpictured=dense is not None)
     fitted = full.fitted(size)
     teaching.propose_background(fitted)
-    targets = scorable(teaching.targets(fitted, run.say), run.say)
-    unshrunk = teaching.full_size(shrunk(full, size))
+    targets = drop_unscorable(teaching.targets(fitted, run.say), run.say)
+    unshrunk = teaching.full_size(keep_larger(full, size))
     cameras = targets.cameras
     networks = load_lpips(lpips, scaled=lpips_input == "scaled") if lpips else None
     rows: list[dict[str, Any]] = []
@@ -174,7 +174,7 @@ def evaluate(
     names = name_scenes(scenes)
     if unshrunk is not None:
         run.say(_describe_own_size(names, rows))
-    better = better_line(names, found, targets, name)
+    better = describe_better(names, found, targets, name)
     if better:
         run.say(better)
     advice = None
@@ -206,7 +206,7 @@ def _write_ladder(
     """Write the page on results of several sizes; print and return which one suffices."""
     from g2ard.io.describe import bytes_of
     from g2ard.jobs.run_views import is_planned
-    from g2ard.jobs.viewer_frame import best_level
+    from g2ard.jobs.viewer_frame import choose_level_views
     from g2ard.poses import best_views
     from g2ard.rendering.targets import Subset, TeacherRenders
     from g2ard.report.ladder import Dense, Rung, label_sizes, recommend_size, write_ladder
@@ -226,7 +226,7 @@ def _write_ladder(
         key=lambda rung: (rung.bytes, rung.name),
     )
     if dense is not None and not teaching.photos and is_planned(views):
-        best = best_level(dense, 1, cameras).resized(max(cameras[0].width, cameras[0].height))
+        best = choose_level_views(dense, 1, cameras).resized(max(cameras[0].width, cameras[0].height))
         shown: Targets = TeacherRenders(dense, best, background=teaching.background)
     else:
         name = best_views(rungs[-1].splats if dense is None else dense, 1, cameras).names[0]

@@ -85,9 +85,9 @@ def _describe(given: ViewFiles) -> tuple[dict[str, Any], list[list[str]]]:
     if scene == path:
         figures = describe(given, _measure_overdraw)
         if figures["kind"] == "views":
-            from g2ard.jobs.start_points import sparse_file, sparse_points
+            from g2ard.jobs.start_points import find_sparse_file, read_sparse_points
 
-            points = sparse_points(sparse_file(path), partial(_add_note, figures))
+            points = read_sparse_points(find_sparse_file(path), partial(_add_note, figures))
             figures["sparse_points"] = 0 if points is None else len(points)
         return figures, _list_figures(figures)
     figures = describe(scene, _measure_overdraw)

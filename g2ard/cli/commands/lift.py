@@ -31,7 +31,7 @@ def lift(
     opacity: Annotated[float, typer.Option(help="Opacity of every disc, between 0 and 1.")] = 0.5,
 ) -> None:
     """Turn a coloured point cloud into surface-aligned Gaussian discs, without training."""
-    from g2ard.jobs.inputs import axes_of
+    from g2ard.jobs.inputs import find_axes
     from g2ard.stages.lift import isolated
     from g2ard.stages.lift import lift as lift_points
 
@@ -52,7 +52,7 @@ def lift(
         normal_ratio=normal_ratio,
         max_anisotropy=max_anisotropy,
         opacity=opacity,
-        axes=axes_of(found, str(cloud), run.say, run.progress),
+        axes=find_axes(found, str(cloud), run.say, run.progress),
         progress=run.progress,
     )
     lifted = time.perf_counter()

@@ -139,9 +139,9 @@ def lod(
     from g2ard.jobs.inputs import GivenViews
     from g2ard.jobs.levels import (
         check_ratios,
-        preparing_levels,
+        choose_tileset_up,
+        open_levels,
         save_tileset,
-        tileset_up,
         write_level_page,
     )
     from g2ard.jobs.memory import LEVELS_TIMES, RECOVERY_TIMES, check_whole_memory
@@ -203,7 +203,7 @@ def lod(
     options: dict[str, Any] = {"ratios": ratios, "recover": recover, "steps": steps, "background": colour}
     options |= {"split_sky": environment, "seed": run.seed, **run.callbacks}
     options |= {"views": views, "size": size, "up": up, "beside": scene}
-    with held, noted, preparing_levels(given, how, planned=dry_run, **options) as job:
+    with held, noted, open_levels(given, how, planned=dry_run, **options) as job:
         if dry_run:
             _tell_costs(run, job)
             return
@@ -221,7 +221,7 @@ def lod(
         if kind == "sog":
             written = save_levels(output, levels.splats, environment=levels.sky, **common)
         else:
-            axis = tileset_up(levels.splats, up, run.say).tolist()
+            axis = choose_tileset_up(levels.splats, up, run.say).tolist()
             stated = source.metres_per_unit or 0.0
             unit = unit or next((name for name, metres in UNITS.items() if abs(metres - stated) < 1e-7), None)
             written = save_tileset(output, levels.splats, up=axis, place=spot, unit=unit, **common)

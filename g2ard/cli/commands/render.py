@@ -15,7 +15,7 @@ import typer
 from g2ard.cli import options as opt
 from g2ard.cli.command import command
 from g2ard.cli.run import Run
-from g2ard.config.choices import BLACK, is_made
+from g2ard.config.choices import BLACK, is_given, is_made
 from g2ard.io.atomic import atomic_folder, check_output
 from g2ard.io.paths import output_names
 from g2ard.progress import plural
@@ -89,9 +89,16 @@ def render(
     from g2ard.io.animations import write_animation
     from g2ard.io.images import to_bytes, write_png
     from g2ard.jobs.inputs import GivenViews, load_views
-    from g2ard.jobs.run_views import at_size, is_planned, looks_at, orbit, planned_at, views_or_pool
+    from g2ard.jobs.run_views import (
+        choose_looks,
+        choose_plan_size,
+        find_or_plan_views,
+        is_planned,
+        orbit,
+        resize_views,
+    )
     from g2ard.jobs.view_checks import warn_of_sight
-    from g2ard.jobs.viewer_frame import backdrop
+    from g2ard.jobs.viewer_frame import choose_backdrop
     from g2ard.rendering.renderer import RasterSettings, Renderer, stations
     from g2ard.rendering.sky import seen_on_sky
 
@@ -109,13 +116,13 @@ def render(
             raise typer.BadParameter(f"-o: {file.name} holds one view, not {count}; give -k 1 or a folder")
 
     check_single(turn or looks or 1)
-    if looks is not None and views is not None and not is_made(views):
+    if looks is not None and is_given(views):
         raise typer.BadParameter("-k generates views, so it excludes --views; give one")
-    if views is not None and not is_made(views):
+    if is_given(views):
         run.refuse_typed("without generated views", "up")
     if file is None or single:
         run.refuse_typed("without an animation", "fps")
-    if size is not None and len(size) > 1 and (around or (views is not None and not is_made(views))):
+    if size is not None and len(size) > 1 and (around or is_given(views)):
         what = "panoramas are twice as wide as high" if around else "given views keep their shape"
         raise typer.BadParameter(f"--size: {what}; give one number, not {size}")
     views = opt.with_images(views, images)
@@ -124,18 +131,18 @@ def render(
     splats = run.load(scene)
     found: Any
     if turn is not None:
-        found = orbit(splats, turn, size=planned_at(size), up=up, beside=scene, say=run.say)
+        found = orbit(splats, turn, size=choose_plan_size(size), up=up, beside=scene, say=run.say)
     elif looks is not None:
-        given = GivenViews(None, None if is_made(views) else scene, up, run.seed, planned_at(size))
-        found = looks_at(splats, looks, given, **run.callbacks)
+        given = GivenViews(None, None if is_made(views) else scene, up, run.seed, choose_plan_size(size))
+        found = choose_looks(splats, looks, given, **run.callbacks)
     else:
-        given = GivenViews(views, scene, up, run.seed, planned_at(size))
-        found = views_or_pool(splats, given, **run.callbacks)
+        given = GivenViews(views, scene, up, run.seed, choose_plan_size(size))
+        found = find_or_plan_views(splats, given, **run.callbacks)
     cameras = load_views(found, split, None, run.say)
     if around:
         cameras = stations(cameras)
     else:
-        cameras = at_size(cameras, size, made=is_planned(found))
+        cameras = resize_views(cameras, size, made=is_planned(found))
         warn_of_sight(splats, cameras, run.say)
     check_single(len(cameras))
     places = output_names(cameras.source or str(views), cameras.names) if output is not None else []
@@ -145,7 +152,7 @@ def render(
     shown: list[NDArray[np.uint8]] = []
     colour = opt.background_of(run, background, scene) or BLACK
     generated = turn is not None or looks is not None or is_planned(found)
-    sky = generated and colour == BLACK and background is None and backdrop(None, [splats]) is None
+    sky = generated and colour == BLACK and background is None and choose_backdrop(None, [splats]) is None
     renderer = Renderer(splats, background=colour, settings=RasterSettings(convention=convention))
 
     def draw(folder: Path | None) -> Iterator[NDArray[np.uint8]]:

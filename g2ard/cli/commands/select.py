@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -12,10 +12,13 @@ from g2ard.cli.budget_options import Count
 from g2ard.cli.command import command
 from g2ard.cli.run import Run
 from g2ard.config.schema import listed
-from g2ard.pipeline.presets import configured
+from g2ard.pipeline.presets import configure
 from g2ard.progress import plural
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
     from g2ard.config.choices import ViewFormat
     from g2ard.io.types import ViewSet
 
@@ -63,7 +66,7 @@ def select(
     if views is None:
         raise typer.BadParameter("give the candidates with --views VIEWS")
     with run.usage():
-        config = configured(SelectConfig(), preset or "auto", settings)
+        config = configure(SelectConfig(), preset or "auto", settings)
     if config.views_count is None:
         raise typer.BadParameter("give the number of views with -k K")
     run.claim_views(output, format)
@@ -109,7 +112,12 @@ def select(
 
 
 def _write(
-    run: Run, output: Path, format: ViewFormat | None, pool: ViewSet, chosen: Any, weights: Any
+    run: Run,
+    output: Path,
+    format: ViewFormat | None,
+    pool: ViewSet,
+    chosen: NDArray[np.int64],
+    weights: NDArray[np.float64],
 ) -> None:
     """Write the chosen views, best first, then the other views outside the training split."""
     import numpy as np

@@ -15,7 +15,7 @@ from g2ard.cli.outputs import Outputs, read_budgets
 from g2ard.cli.run import Run
 from g2ard.cli.run_result import count_tiles, describe_memory, say_fit, say_weight, tell_quality
 from g2ard.cli.work_folder import read_tiling, work_folder
-from g2ard.config.choices import is_made
+from g2ard.config.choices import is_given
 from g2ard.config.schema import listed
 from g2ard.io import Source
 from g2ard.io.atomic import atomic_output
@@ -71,7 +71,7 @@ def simplify(
 
     from g2ard.jobs.inputs import GivenViews
     from g2ard.jobs.memory import WHOLE_TIMES, check_whole_memory
-    from g2ard.jobs.simplify import parents_of, reducing
+    from g2ard.jobs.simplify import open_reduction, read_parents
     from g2ard.jobs.tile_options import is_tiled
     from g2ard.stages.simplify import SimplifyConfig
 
@@ -83,7 +83,7 @@ def simplify(
         raise typer.BadParameter("--keep-region needs views; remove --no-views")
     if config.method == "paper":
         run.refuse_typed("on the method paper", "views", "images")
-    given_views = views is not None and not is_made(views)
+    given_views = is_given(views)
     if given_views or no_views or config.method == "paper" or (config.method == "fast" and views is None):
         run.refuse_typed("without generated views", "up")
     source = Source(scene, run.render_model, others or ())
@@ -126,9 +126,9 @@ def simplify(
     }
     inputs |= {"planned": dry_run, "counted": counted, **run.callbacks}
     held = work_folder(run, None if dry_run else how, given)
-    with held, reducing(source, how, config=config, **inputs) as reduce:
+    with held, open_reduction(source, how, config=config, **inputs) as reduce:
         reading = (started := time.perf_counter()) - began  # shared by all budgets
-        wanted = [reduce.resolved(budget, str(scene), name) for budget in budgets]
+        wanted = [reduce.resolve(budget, str(scene), name) for budget in budgets]
         if outputs is None:
             _tell_plan(run, reduce, [one.count for one in wanted])
             return
@@ -143,7 +143,7 @@ def simplify(
                     atomic_output(parents, overwrite=run.overwrite) as temporary,
                     temporary.open("wb") as file,
                 ):
-                    np.save(file, parents_of(small, source))
+                    np.save(file, read_parents(small, source))
             written = time.perf_counter()
             seconds = {"read": reading, "simplify": simplified - started, "write": written - simplified}
             seconds["total"], started = sum(seconds.values()), written

@@ -78,9 +78,9 @@ def _is_levels(path: Path) -> bool:
 
 def _find_dense(path: Path) -> Path | None:
     """Return the scene that a run was made of, if it is there and browsers can show it."""
-    from g2ard.jobs.comparison import source_of
+    from g2ard.jobs.comparison import find_source
 
-    dense = source_of(path)
+    dense = find_source(path)
     if dense is None or not dense.is_file():
         return None
     return dense if Source(dense).count <= _LARGEST_DENSE else None
@@ -99,19 +99,19 @@ def _write(
 ) -> None:
     """Write the page of one scene or two."""
     from g2ard.io import read_views
-    from g2ard.jobs.comparison import dense_first, made_of_points
+    from g2ard.jobs.comparison import is_made_of_points, put_dense_first
     from g2ard.jobs.inputs import GivenViews
-    from g2ard.jobs.viewer_frame import backdrop, frame_of
+    from g2ard.jobs.viewer_frame import choose_backdrop, choose_frame
     from g2ard.viewer.page import write_page
 
     views = opt.with_images(given, images)
     run.claim_file("--output", output, page=True)
-    shown, roles = ([scene], ()) if other is None else dense_first(scene, other)
+    shown, roles = ([scene], ()) if other is None else put_dense_first(scene, other)
     sources = [Source(path, run.render_model) for path in shown]
     loaded = [run.load(source) for source in sources]
     if views is None and scene.is_dir() and (own := scene / "views.json").is_file():
         views = own if any(read_views(own).image_paths) else "made"  # generated ones show what trains
-    stand = frame_of(loaded[0], GivenViews(views, sources[0].file, up), start=start, say=run.say)
+    stand = choose_frame(loaded[0], GivenViews(views, sources[0].file, up), start=start, say=run.say)
     labels = label_scenes(sources, [len(splats) for splats in loaded], roles)
     known = opt.background_of(run, background, scene, other)
     opened = sources[shown.index(scene)]
@@ -120,7 +120,7 @@ def _write(
         output,
         [(label, stand.of(splats)) for label, splats in zip(labels, loaded, strict=True)],
         start=stand.start,
-        background=backdrop(known, loaded, of_points=made_of_points(scene, opened)),
+        background=choose_backdrop(known, loaded, of_points=is_made_of_points(scene, opened)),
         overwrite=run.overwrite,
         progress=run.progress,
     )

@@ -87,7 +87,7 @@ def recover(
     student = student if unit is student.quats else replace(student, quats=unit)
     if not len(student) or not len(targets.cameras):
         raise InputError(f"nothing to recover: got {len(student)} Gaussians and {len(targets.cameras)} views")
-    if not targets.cameras.facing(student.means.astype(np.float64) + student.offset).any():
+    if not targets.cameras.facing(student.positions).any():
         raise InputError(unseeing(targets.cameras, "the scene"))
     if frozen is not None and (config.engine != "fused" or frozen.shape != (len(student),)):
         raise InputError(

@@ -134,7 +134,7 @@ def _check(cameras: Cameras, k: int | Literal["auto"], policy: str) -> None:
     require("k", k, k == "auto" or k >= 1, "at least 1 view")
     if not len(cameras):
         raise InputError("no candidate views to select from")
-    large = np.maximum(cameras.widths, cameras.heights) > _LARGEST_VIEW_SIDE
+    large = cameras.sides > _LARGEST_VIEW_SIDE
     if large.any():
         i = int(np.argmax(large))
         size = f"{cameras.widths[i]}×{cameras.heights[i]}"
