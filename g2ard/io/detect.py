@@ -202,7 +202,8 @@ def _of_file(path: Path, modified: int, size: int) -> str:
 
 def _check_content(path: Path) -> None:
     """Reject a file of another program, or of another format than its name says."""
-    sign, suffix = sign_of(path), path.suffix.lower()
+    sign = sign_of(path)
+    suffix = path.suffix.lower()
     if sign is None:
         return
     if not sign.reads:

@@ -82,7 +82,9 @@ class _Scan(PointStream):
     """A scan's points, at world = rotation @ x + translation."""
 
     def __init__(self, path: Path, header: Any, number: int) -> None:
-        self.path, self.count, self._number = path, header.point_count, number
+        self.path = path
+        self.count = header.point_count
+        self._number = number
         self.fields = tuple(header.point_fields)
         self._names = names = set(self.fields)
         place = next((fields for fields in (_CARTESIAN, _SPHERICAL) if names.issuperset(fields)), None)
@@ -207,7 +209,8 @@ def read(views: ViewFiles) -> Listed:
     Panoramas of the full sphere look along x with z up; pinhole images look along −z with y up, as the format
     defines. Others (for reference, cylindrical, without a pose) are left out with a note.
     """
-    path, images = views.path, views.images
+    path = views.path
+    images = views.images
     if images is not None:
         raise InputError("has its photos inside", hint="leave {images} out")
     with _opened(path) as file:
@@ -264,7 +267,8 @@ def _frame(number: int, node: Any, folder: Path) -> Frame | str:
 
 def _pose(node: Any) -> Float:
     """Return world_from_photo; parts that are missing are those of the identity."""
-    quat, shift = [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0]
+    quat = [1.0, 0.0, 0.0, 0.0]
+    shift = [0.0, 0.0, 0.0]
     if node.isDefined("rotation"):
         quat = [float(node["rotation"][axis].value()) for axis in "wxyz"]
     if node.isDefined("translation"):

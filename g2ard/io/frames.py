@@ -68,7 +68,8 @@ class Lens(NamedTuple):
         distortion: tuple[float, ...] = (0.0,) * 5,
     ) -> Lens:
         """Return the lens of focal lengths and a principal point, None for the middle of the image."""
-        (fx, fy), (cx, cy) = focal, (size[0] / 2, size[1] / 2) if middle is None else middle
+        fx, fy = focal
+        cx, cy = (size[0] / 2, size[1] / 2) if middle is None else middle
         return cls(size, np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], float), distortion)
 
     @classmethod
@@ -142,14 +143,16 @@ def make_rigid(matrix: Float, place: Place) -> Float:
     if not s[0] > 0 or s[2] < 0.99 * s[0] or np.linalg.det(R) < 0:
         raise place.error("is not a rotation and a translation")
     out = np.eye(4)
-    out[:3, :3], out[:3, 3] = R, matrix[:3, 3]
+    out[:3, :3] = R
+    out[:3, 3] = matrix[:3, 3]
     return out
 
 
 def make_pose(quat: ArrayLike, translation: ArrayLike) -> Float:
     """Return the (4, 4) rigid transform of a quaternion wxyz, of any length, and a translation."""
     out = np.eye(4)
-    out[:3, :3], out[:3, 3] = rotation_matrices(np.array([quat]))[0], translation
+    out[:3, :3] = rotation_matrices(np.array([quat]))[0]
+    out[:3, 3] = translation
     return out
 
 
@@ -157,7 +160,8 @@ def invert_pose(matrix: Float) -> Float:
     R = matrix[:3, :3]
     t = matrix[:3, 3]
     out = np.eye(4)
-    out[:3, :3], out[:3, 3] = R.T, -R.T @ t
+    out[:3, :3] = R.T
+    out[:3, 3] = -R.T @ t
     return out
 
 

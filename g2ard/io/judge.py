@@ -147,7 +147,9 @@ def judge_storage(
             The definition holds, and doubts are noted, unless the numbers make no sense in it.
         apart: usual distance of neighbours, which equal scales do not exceed by much.
     """
-    count, (small, large), (faint, solid) = len(opacities), bulk_range(scales), bulk_range(opacities)
+    count = len(opacities)
+    small, large = bulk_range(scales)
+    faint, solid = bulk_range(opacities)
     enough = count >= _FEWEST
     told: list[str] = []
     opaque = None if logs else 1.0
@@ -188,7 +190,8 @@ def fill_linear(raw: Raw, scales: Values, opacities: Values, base: Values) -> li
     read = judge_storage(scales, opacities, base, logs=False)
     with np.errstate(divide="ignore", invalid="ignore"):
         raw.log_scales[:] = scales if read.log_scales else np.log(scales.astype(float))
-        raw.logit_opacities[:], raw.sh0[:, 0] = read.opacity_logits(opacities), read.sh0(base)
+        raw.logit_opacities[:] = read.opacity_logits(opacities)
+        raw.sh0[:, 0] = read.sh0(base)
     return list(read.notes)
 
 

@@ -55,7 +55,8 @@ def composite(image: Float32, background: Sequence[float]) -> Float32:
 
 
 def _load_image(cameras: Cameras, index: int) -> Float32:
-    path, name = cameras.image_paths[index], cameras.names[index]
+    path = cameras.image_paths[index]
+    name = cameras.names[index]
     if path is None:
         raise InputError(f"({name}) has no photo", index=index, item="view", hint="pass views with photos")
     named = None if cameras.source is None else f"{cameras.source} names it as view {name!r}"
@@ -139,7 +140,8 @@ def load_mask(cameras: Cameras, index: int) -> Mask | None:
 
 def _load_mask(cameras: Cameras, index: int, image: Float32 | None) -> Mask | None:
     """Return the mask of a photo. A photo that is its own mask is read, unless `image` holds it."""
-    held, path = _find_held(cameras, index), cameras.mask_paths[index]
+    held = _find_held(cameras, index)
+    path = cameras.mask_paths[index]
     if path is None:
         return held
     if path == cameras.image_paths[index]:
@@ -186,9 +188,12 @@ def _sample(image: Float32, u: Float, v: Float, around: bool = False) -> Float32
         around: whether the last column is beside the first, as in a panorama.
     """
     height, width = image.shape[:2]
-    u, v = u if around else np.clip(u, 0, width - 1), np.clip(v, 0, height - 1)
-    left, above = np.floor(u).astype(int), np.floor(v).astype(int)
-    right, down = (u - left)[:, None].astype(np.float32), (v - above)[:, None].astype(np.float32)
+    u = u if around else np.clip(u, 0, width - 1)
+    v = np.clip(v, 0, height - 1)
+    left = np.floor(u).astype(int)
+    above = np.floor(v).astype(int)
+    right = (u - left)[:, None].astype(np.float32)
+    down = (v - above)[:, None].astype(np.float32)
     top, bottom = (
         image[row, left % width] * (1 - right) + image[row, (left + 1) % width] * right
         for row in (above, np.minimum(above + 1, height - 1))

@@ -66,7 +66,9 @@ class Stream(RawStream):
         rest = sorted((p for p in names if re.fullmatch(r"f_rest_\d{1,3}", p)), key=lambda p: int(p[7:]))
         stored, kept = _bands(rest)
         rows = _joined(plyfiles.read_element(path, header, *groups))
-        self._names, self._path, self._rows = names, path, rows
+        self._names = names
+        self._path = path
+        self._rows = rows
         shift = np.zeros(3)
         if rows.dtype[names["x"]].itemsize == 8:
             sample = plyfiles.spread_rows(rows)
@@ -85,8 +87,11 @@ class Stream(RawStream):
         super().__init__(path, len(rows), kept, offset, tuple(notes), model)
         self.up = plyfiles.up_of(header.comments)
         self.restore(plyfiles.axes_of(header))
-        self._shift, self._flat = shift, flat
-        self._rest, self._stored, self._kept = rest, stored, kept
+        self._shift = shift
+        self._flat = flat
+        self._rest = rest
+        self._stored = stored
+        self._kept = kept
         self._read, self._white = self._judged()
         self.notes += self._read.notes
 
@@ -115,7 +120,8 @@ class Stream(RawStream):
     def _judged(self) -> tuple[Reading, float]:
         """Return how values are stored, and the number that means white in RGB."""
         rows = plyfiles.spread_rows(self._rows, _JUDGED)
-        scales, base = self._columns(rows, self._scales), self._columns(rows, self._rgb or _DC)
+        scales = self._columns(rows, self._scales)
+        base = self._columns(rows, self._rgb or _DC)
         opacities = rows[self._names["opacity"]]
         with np.errstate(over="ignore", invalid="ignore"):
             wide = 2 * np.exp(np.median(scales)) if len(rows) else 0.0
@@ -153,7 +159,8 @@ def _joined(groups: list[Values]) -> Values:
     """Return groups of rows as one, with zeros for harmonics past their degrees; the last has the most."""
     if len(groups) == 1:
         return groups[0]
-    rows, at = np.zeros(sum(map(len, groups)), groups[-1].dtype), 0
+    rows = np.zeros(sum(map(len, groups)), groups[-1].dtype)
+    at = 0
     most = sum(name.startswith("f_rest_") for name in rows.dtype.names or ()) // 3
     for group in groups:
         names = group.dtype.names or ()
@@ -172,15 +179,18 @@ def _widen(raw: Raw, size: Float) -> None:
         after = np.logaddexp(before, 2 * np.log(np.abs(size))[:, None])
     fading = 0.5 * (before - after).sum(axis=1)
     logits = raw.logit_opacities.astype(float)
-    lit, dark = -np.logaddexp(0, -logits), -np.logaddexp(0, logits)  # logarithms of α and 1 − α
+    lit = -np.logaddexp(0, -logits)
+    dark = -np.logaddexp(0, logits)  # logarithms of α and 1 − α
     with np.errstate(divide="ignore"):
         faded = np.logaddexp(dark, lit + np.log(-np.expm1(fading)))
-    raw.log_scales[:], raw.logit_opacities[:] = after / 2, lit + fading - faded
+    raw.log_scales[:] = after / 2
+    raw.logit_opacities[:] = lit + fading - faded
 
 
 def _frames(header: plyfiles.PlyHeader) -> list[Note]:
     """Return a note on elements with changes of the Gaussians over time."""
-    count, groups = header.counts.get("vertex"), plyfiles.groups_of(header)
+    count = header.counts.get("vertex")
+    groups = plyfiles.groups_of(header)
     moving = [name for name, rows in header.counts.items() if name not in groups and rows == count != 1]
     if not moving:
         return []
@@ -228,14 +238,18 @@ def write(
         The largest change of a position by rounding.
     """
     require("layout", repr(layout), layout in (None, "inria"), "'inria' or None")
-    normals, degree = normals or layout == "inria", 3 if layout == "inria" else scene.sh_degree
+    normals = normals or layout == "inria"
+    degree = 3 if layout == "inria" else scene.sh_degree
     error = 0.0
     if isinstance(scene, Splats):
-        error, frame = rounding(scene, scene.narrowed()), as_stored(scene)
-        count, parts = len(frame), iter([frame])
+        error = rounding(scene, scene.narrowed())
+        frame = as_stored(scene)
+        count = len(frame)
+        parts = iter([frame])
     else:
         frame = as_stored(scene.placed(Raw.empty(0, 0)))
-        count, parts = scene.count, map(as_stored, scene.blocks(BLOCK))
+        count = scene.count
+        parts = map(as_stored, scene.blocks(BLOCK))
     if not count:
         raise InputError("not written: the scene has no Gaussians", path=path)
     names = [*_MEANS, *(_NORMALS if normals else []), *_DC]

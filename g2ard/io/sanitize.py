@@ -146,7 +146,9 @@ class Tally:
         return keep
 
     def _clean(self, raw: Raw) -> Mask:
-        logits, scales, quats = raw.logit_opacities, raw.log_scales, raw.quats
+        logits = raw.logit_opacities
+        scales = raw.log_scales
+        quats = raw.quats
         good: Mask = ~np.isnan(logits) & ~(np.isnan(scales) | (scales == np.inf)).any(1)
         for values in (raw.means, quats, raw.sh0, raw.shN):
             good &= _finite_rows(values)
@@ -171,7 +173,8 @@ class Tally:
 
     def notes(self, path: Path | None = None) -> list[Note]:
         """Return notes on all rows; raise an `InputError` if none remains."""
-        points, left = self.item == "point", self.rows - self.dropped
+        points = self.item == "point"
+        left = self.rows - self.dropped
         if not self.rows:
             raise InputError(f"has no {self.item}s", path=path)
         if not left:

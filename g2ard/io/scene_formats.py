@@ -100,7 +100,8 @@ def lost_in(path: AnyPath, splats: Splats, **options: object) -> list[Note]:
     """Return notes on what the format of an output path cannot hold; `options` are the writer's."""
     from g2ard.io.types import Note
 
-    output_format, notes = scene_format(path), list[Note]()
+    output_format = scene_format(path)
+    notes = list[Note]()
     is_spz = output_format.module == "spz" or options.get("compress") == "spz"
     if splats.antialiased and not (output_format.models or is_spz):  # SPZ inside a .glb has a flag for it
         suffix = output_format.suffix
@@ -177,7 +178,8 @@ class Rounding:
 
 def axes_note(path: AnyPath, options: dict[str, Any]) -> str | None:
     """Return a note on the axes of a written file if programs differ in them; `options` are the writer's."""
-    output_format, axes = scene_format(path), options.get("axes")
+    output_format = scene_format(path)
+    axes = options.get("axes")
     if "axes" not in output_format.options or (axes is not None and options.get("spz_version", 3) == 4):
         return None
     if axes == "RDF":

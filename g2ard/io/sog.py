@@ -95,13 +95,16 @@ class _Chunk:
     """A meta.json and the images beside it, in a folder or an archive; `place` is that for errors."""
 
     def __init__(self, place: Path, files: Path | zipfile.Path) -> None:
-        self.place, self.files, self.file = place, files, Place(place / "meta.json")
+        self.place = place
+        self.files = files
+        self.file = Place(place / "meta.json")
         text = decoded(self.file.path, self.read("meta.json"))
         self.meta = checked(parse_json(self.file.path, text), _Meta, self.file)
 
     def read(self, name: str) -> bytes:
         """Read a file, from an archive within `check_unpacked`."""
-        file, path = self.files / name, self.place / name
+        file = self.files / name
+        path = self.place / name
         try:
             if isinstance(file, zipfile.Path):
                 info = file.root.getinfo(file.at)
@@ -180,7 +183,8 @@ class _Decoder:
     """Images of a chunk, 20 to 28 bytes per Gaussian, and the lookup tables of their bytes."""
 
     def __init__(self, chunk: _Chunk, count: int) -> None:
-        meta, self.chunk = chunk.meta, chunk
+        meta = chunk.meta
+        self.chunk = chunk
         names = [*meta.means.files[:2], meta.quats.files[0], meta.scales.files[0], meta.sh0.files[0]]
         self._low, self._high, self._quats, self._scales, self._base = (chunk.rows(n, count) for n in names)
         self._positions = _positions(meta.means)
@@ -257,7 +261,8 @@ def _values(place: Place, part: _Part) -> Callable[[Bytes], Values]:
     if part.codebook is UNSET:
         low, high = _ends(place, part, slice(3))
         return lambda codes: low + (high - low) * (codes / 255)
-    place, book = place.to("codebook"), np.array(part.codebook, float)
+    place = place.to("codebook")
+    book = np.array(part.codebook, float)
     wrong = np.isfinite(book) & (np.abs(book) > _LARGEST_FLOAT32)
     if wrong.any():
         raise place.to(int(np.argmax(wrong))).error("is beyond the range of float32")
@@ -335,7 +340,8 @@ def chunks_of(path: Path) -> list[Path]:
 def _listed(index: Path) -> list[Path]:
     """Return the chunks that lod-meta.json's tree uses at level 0, in the order of its list, and the sky."""
     content = checked(read_json(index), _Levels, Place(index))
-    names, sky = content.filenames, content.environment
+    names = content.filenames
+    sky = content.environment
     files = [_chunk_at(index.parent / name.replace("\\", "/")) for name in names]
     used: set[int] = set()
     nodes = [(content.tree, Place(index).to("tree"))]

@@ -102,7 +102,8 @@ def sog_files(
     if not ordered:
         splats = splats.take(packing_order(splats.means))
     width, height = _size(path, len(splats))
-    files, meta = {}, {"version": 2, "asset": {"generator": f"g2ard {__version__}"}, "count": len(splats)}
+    files = {}
+    meta = {"version": 2, "asset": {"generator": f"g2ard {__version__}"}, "count": len(splats)}
     meta["antialias"] = splats.antialiased
     if splats.antialiased:
         meta["model"] = "antialiased"  # newer spelling

@@ -78,7 +78,10 @@ class Stream(ABC, Generic[Block]):
         notes: Notes = (),
         item: str = "Gaussian",
     ) -> None:
-        self.path, self.count, self.notes, self.tally = path, count, notes, Tally(item)
+        self.path = path
+        self.count = count
+        self.notes = notes
+        self.tally = Tally(item)
         self.offset = np.zeros(3) if offset is None else offset
 
     def __len__(self) -> int:
@@ -114,7 +117,8 @@ class Stream(ABC, Generic[Block]):
 
         Parts that are read one after the other are read in one pass.
         """
-        known, self._reading = self._reading, None
+        known = self._reading
+        self._reading = None
         blocks = known[1] if known and known[0] == (kind, first) else getattr(self, kind)(rows, first)
         for tally in self.tallies():
             tally.clear()
@@ -169,14 +173,16 @@ class SceneStream(Stream[Splats]):
         render_model: RenderModel = "classic",
     ) -> None:
         super().__init__(path, count, offset, notes)
-        self.render_model, self.sh_degree = render_model, _DEGREE_OF_REST[rest]
+        self.render_model = render_model
+        self.sh_degree = _DEGREE_OF_REST[rest]
         self.up: tuple[float, float, float] | None = None
         self.axes: Axes = "RDF"
 
     def whole(self) -> Splats:
         """Read all rows into memory; `all_notes` are then those on these rows."""
         self.tally = Tally()
-        raw, kept = Raw.empty(self.count, (self.sh_degree + 1) ** 2 - 1), 0
+        raw = Raw.empty(self.count, (self.sh_degree + 1) ** 2 - 1)
+        kept = 0
         for block in self.blocks(BLOCK):
             rows = raw.take(slice(kept, kept := kept + len(block)))
             rows.fill(getattr(block, name) for name in ARRAYS)
@@ -194,7 +200,9 @@ class RawStream(SceneStream):
     def restore(self, axes: Axes) -> None:
         """Turn what the file holds, y down, to coordinates of these axes."""
         found = restored(self.placed(Raw.empty(0, 0)), axes)
-        self.axes, self.offset, self.up = axes, found.offset, found.up
+        self.axes = axes
+        self.offset = found.offset
+        self.up = found.up
 
     def in_axes(self, means: Float32) -> Float32:
         """Return stored means in the scene's axes."""
@@ -211,7 +219,8 @@ class RawStream(SceneStream):
 
     def blocks(self, rows: int, start: int = 0) -> Iterator[Splats]:
         for raw in self.raw(rows, start):
-            before, keep = self.tally.dropped, self.tally.clean(raw)
+            before = self.tally.dropped
+            keep = self.tally.clean(raw)
             splats = restored(raw.activated(self.render_model, np.zeros(3)), self.axes)
             splats = stand_as(replace(splats, offset=self.offset), self)
             yield splats if self.tally.dropped == before else splats.take(keep)
@@ -236,13 +245,17 @@ class PartsStream(SceneStream):
         render_model: RenderModel = "classic",
     ) -> None:
         super().__init__(path, sum(counts), (sh_degree + 1) ** 2 - 1, offset, notes, render_model)
-        self.counts, self._part, self._identity = counts, part, identity
+        self.counts = counts
+        self._part = part
+        self._identity = identity
 
     @classmethod
     def of(cls, path: Path, splats: Splats, notes: Notes) -> PartsStream:
         """Return the scene of a file that was read as a whole."""
         stream = cls(path, [len(splats)], lambda _: splats, splats.sh_degree, splats.offset, notes=notes)
-        stream.render_model, stream.up, stream.axes = splats.render_model, splats.up, splats.axes
+        stream.render_model = splats.render_model
+        stream.up = splats.up
+        stream.axes = splats.axes
         return stream
 
     def identity(self) -> list[Any]:
@@ -309,7 +322,8 @@ class PointStream(Stream[RawPoints]):
         good = np.isfinite(positions).all(axis=1) & ~noise
         placed = good & positions.any(axis=1)
         low, high = np.percentile(positions[placed], (1, 99), axis=0) if placed.any() else np.zeros((2, 3))
-        middle, extent = (low + high) / 2, high - low
+        middle = (low + high) / 2
+        extent = high - low
         far = np.isfinite(middle).all() and (np.abs(middle) > np.linalg.norm(extent)).any()
         zeros = int(np.count_nonzero(good & ~placed))
         away = bool((np.abs(middle) > _FAR * np.linalg.norm(extent)).any() and extent.any())
@@ -319,8 +333,10 @@ class PointStream(Stream[RawPoints]):
         notes = (*notes, *note_coarse(self.sample, spacing(self.sample, count)))
         notes = (*notes, _DEGREES) if _in_degrees(middle, extent) else notes
         super().__init__(path, count, np.rint(middle) if far else None, notes, "point")
-        self.channels, self.scales = values.shape[1], scales
-        self.lack, self.todo = "has neither colours nor intensities that vary", ""
+        self.channels = values.shape[1]
+        self.scales = scales
+        self.lack = "has neither colours nor intensities that vary"
+        self.todo = ""
         self.system: str | None = None
         self.metres_per_unit: float | None = None
         self.axes: Axes | None = "RFU" if far else None
@@ -351,7 +367,8 @@ class PointStream(Stream[RawPoints]):
             yield positions, values, noise | ~positions.any(axis=1) if self._zeros_are_lost else noise
 
     def header_notes(self) -> Notes:
-        notes, (dark, full) = list(self.notes), self._range
+        notes = list(self.notes)
+        dark, full = self._range
         rows = self.tally.rows - self.tally.dropped - self.tally.noise
         if not rows:
             return tuple(notes)
@@ -394,7 +411,9 @@ class PointStream(Stream[RawPoints]):
 
     def whole(self) -> Cloud:
         """Read all points."""
-        positions, colors, kept = np.empty((self.count, 3)), np.empty((self.count, 3), np.float32), 0
+        positions = np.empty((self.count, 3))
+        colors = np.empty((self.count, 3), np.float32)
+        kept = 0
         for block in self.blocks(_POINTS_AT_ONCE):
             rows = slice(kept, kept := kept + len(block[0]))
             positions[rows], colors[rows] = block
@@ -416,7 +435,8 @@ class HeldPoints(PointStream):
         columns: Mapping[str, Values] = MappingProxyType({}),
     ) -> None:
         self._held = positions, values.astype(np.float32), np.zeros(len(positions), bool)
-        self.fields, self._columns = tuple(columns), columns
+        self.fields = tuple(columns)
+        self._columns = columns
         super().__init__(path, len(positions), self._held, scales)
 
     def raw(self, rows: int, start: int) -> Iterator[MarkedPoints]:
@@ -473,8 +493,10 @@ class JoinedScenes(Joined[Splats], SceneStream):
     streams: Sequence[SceneStream]
 
     def __init__(self, streams: Sequence[SceneStream]) -> None:
-        self.streams, rest = streams, (max(stream.sh_degree for stream in streams) + 1) ** 2 - 1
-        count, model = sum(s.count for s in streams), one_model([s.render_model for s in streams])
+        self.streams = streams
+        rest = (max(stream.sh_degree for stream in streams) + 1) ** 2 - 1
+        count = sum(s.count for s in streams)
+        model = one_model([s.render_model for s in streams])
         SceneStream.__init__(self, streams[0].path, count, rest, streams[0].offset, render_model=model)
         ups = {stream.up for stream in streams}
         self.up = ups.pop() if len(ups) == 1 else None
@@ -513,7 +535,8 @@ class JoinedClouds(Joined[RawPoints], PointStream):
         at = np.concatenate([stream.sample for stream in streams])
         sample = at, np.zeros((len(at), 0), np.float32), np.zeros(len(at), bool)
         PointStream.__init__(self, streams[0].path, sum(s.count for s in streams), sample)
-        self.channels, self.lack = max(stream.channels for stream in streams), streams[0].lack
+        self.channels = max(stream.channels for stream in streams)
+        self.lack = streams[0].lack
         self.axes = streams[0].axes if len({stream.axes for stream in streams}) == 1 else self.axes
         stated = {stream.system: stream.path.name for stream in reversed(streams) if stream.system}
         if len(stated) > 1:

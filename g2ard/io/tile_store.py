@@ -224,7 +224,8 @@ class TileStore:
         Raises:
             InputError: as for `read`.
         """
-        rows, crc = self.rows(index), 0
+        rows = self.rows(index)
+        crc = 0
         for start in range(0, len(rows), _ROWS_AT_ONCE):
             crc = zlib.crc32(rows[start : start + _ROWS_AT_ONCE].data, crc)
         self._check_contents(tile_name(index), crc, self.tiles[index].checks[0])
@@ -269,11 +270,15 @@ class TileStore:
     def unpacked(self, count: int, blocks: Iterable[Float32], *, sh: bool = True) -> Splats:
         """Return the scene of `count` packed rows, given in blocks; `sh` as for `read`."""
         rest = (self.sh_degree + 1) ** 2 - 1 if sh else 0
-        raw, start = Raw.empty(count, rest), 0
+        raw = Raw.empty(count, rest)
+        start = 0
         for rows in blocks:
             part = raw.take(slice(start, start := start + len(rows)))
-            part.means[:], part.quats[:], part.log_scales[:] = rows[:, :3], rows[:, 3:7], rows[:, 7:10]
-            part.logit_opacities[:], part.sh0[:, 0] = rows[:, 10], rows[:, 11:14]
+            part.means[:] = rows[:, :3]
+            part.quats[:] = rows[:, 3:7]
+            part.log_scales[:] = rows[:, 7:10]
+            part.logit_opacities[:] = rows[:, 10]
+            part.sh0[:, 0] = rows[:, 11:14]
             part.shN[:] = rows[:, 14 : 14 + 3 * rest].reshape(len(rows), rest, 3)
         splats = raw.activated(self.render_model, self.offset.copy(), self.up)
         return replace(splats, axes=self.axes)
@@ -307,7 +312,8 @@ class Stream(PartsStream):
         counts = [tile.rows for tile in store.tiles]
         parts = counts, store.read, store.sh_degree, store.offset
         super().__init__(path, *parts, [store.key], store.notes, store.render_model)
-        self.up, self.axes = store.up, store.axes
+        self.up = store.up
+        self.axes = store.axes
 
     def absolute(self) -> Stream:
         return Stream(self.path.absolute())

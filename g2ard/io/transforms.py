@@ -244,7 +244,8 @@ def _intrinsics(place: Place, frame: _Frame, photo: Path) -> Lens:
 
 
 def _pinhole(place: Place, frame: _Frame, size: Size) -> Lens:
-    (width, height), distortion = size, (frame.k1, frame.k2, frame.p1, frame.p2, frame.k3)
+    width, height = size
+    distortion = (frame.k1, frame.k2, frame.p1, frame.p2, frame.k3)
     if (K := _matrix(place, frame)) is not None:
         return Lens((width, height), K, distortion)
     if frame.fl_x is UNSET:

@@ -34,7 +34,8 @@ def view_format(path: Path, given: ViewFormat | None = None) -> ViewFormat:
     >>> [view_format(Path(name)) for name in ("poses.json", "a/cameras.json", "transforms_1.json", "model")]
     ['g2ard', 'inria', 'nerfstudio', 'colmap']
     """
-    suffix, name = path.suffix.lower(), path.name.lower()
+    suffix = path.suffix.lower()
+    name = path.name.lower()
     if given is None and suffix == "":
         return "colmap"
     expected = "" if given == "colmap" else ".json"
@@ -56,7 +57,8 @@ def lost_views(
 
     if format == "g2ard":
         return []
-    inria, nerfstudio = format == "inria", format == "nerfstudio"
+    inria = format == "inria"
+    nerfstudio = format == "nerfstudio"
     middle = [[w / 2, h / 2] for w, h in zip(cameras.widths, cameras.heights, strict=True)]
     off = int((abs(cameras.Ks[:, :2, 2] - middle).max(axis=1) > _OFF_CENTRE).sum())
     bent = int(cameras.distortions[:, 0 if inria else 4 :].any(axis=1).sum())

@@ -35,7 +35,8 @@ _UNCOLORED_NOTES = ("grey", "black", "black_points")
 
 def colored(cloud: Cloud, train: Cameras, name: str, *, progress: Progress = silent, say: Say) -> Points:
     """Return a cloud's points, those without a colour with that of training photos, where any sees them."""
-    points, bare = cloud.points, ~cloud.colored
+    points = cloud.points
+    bare = ~cloud.colored
     if not bare.any():
         return points
     cameras = train.fitted(_PHOTO_SIDE)
@@ -68,7 +69,9 @@ class ColoredStream(PointStream):
     @cached_property
     def hiding(self) -> NDArray[np.float64]:
         """Points that hide others."""
-        stride, read, parts = max(1, self.count // _HIDING), 0, []
+        stride = max(1, self.count // _HIDING)
+        read = 0
+        parts = []
         for near in self.positions(1 << 20):
             parts.append(near[-read % stride :: stride])
             read += len(near)
@@ -172,9 +175,11 @@ def median_colors(
         sample = image[pixels[:, 1], pixels[:, 0]]
         if mask is not None:
             held = mask[pixels[:, 1], pixels[:, 0]]
-            rows, sample = rows[held], sample[held]
+            rows = rows[held]
+            sample = sample[held]
         if image.shape[2] == 4:
-            rows, sample = rows[sample[:, 3] > 0.5], sample[sample[:, 3] > 0.5]
+            rows = rows[sample[:, 3] > 0.5]
+            sample = sample[sample[:, 3] > 0.5]
             sample = sample[:, :3] / sample[:, 3:]
         kept[rows, count[rows]] = np.rint(255 * np.clip(sample, 0, 1))
         count[rows] += 1
@@ -191,7 +196,8 @@ def _find_seen(
     """Return (N, 2) columns and rows of points in a view, and whether they are inside and not hidden."""
     pixels, depth, inside = own = _project(positions, cameras, view)
     others, depths, drawn = own if hiding is positions else _project(hiding, cameras, view)
-    width, height = int(cameras.widths[view]), int(cameras.heights[view])
+    width = int(cameras.widths[view])
+    height = int(cameras.heights[view])
     side = max(1.0, np.sqrt(width * height * _CELL_POINTS / max(1, int(drawn.sum()))))
     across = int(width / side) + 1
 
@@ -207,11 +213,14 @@ def _project(
     positions: NDArray[np.float64], cameras: Cameras, view: int
 ) -> tuple[NDArray[np.intp], NDArray[np.float64], NDArray[np.bool_]]:
     """Return (N, 2) columns and rows of points in a view, their depths, and whether they are inside."""
-    width, height = int(cameras.widths[view]), int(cameras.heights[view])
-    pose, K = cameras.viewmats[view].astype(np.float64), cameras.Ks[view]
+    width = int(cameras.widths[view])
+    height = int(cameras.heights[view])
+    pose = cameras.viewmats[view].astype(np.float64)
+    K = cameras.Ks[view]
     local = positions @ pose[:3, :3].T + pose[:3, 3]
     depth = local[:, 2]
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        u, v = local[:, 0] / depth * K[0, 0] + K[0, 2], local[:, 1] / depth * K[1, 1] + K[1, 2]
+        u = local[:, 0] / depth * K[0, 0] + K[0, 2]
+        v = local[:, 1] / depth * K[1, 1] + K[1, 2]
     inside = (depth > 0) & (u >= 0) & (v >= 0) & (u < width) & (v < height)
     return np.where(inside[:, None], np.stack([u, v], axis=1), 0).astype(np.intp), depth, inside

@@ -66,7 +66,8 @@ def visual_hull(cameras: Cameras, outlines: Sequence[Mask | None], middle: Float
         return None
     half = float(np.median(np.linalg.norm(cameras.positions - middle, axis=1)))
     told = np.random.default_rng(0).permutation(told).tolist()  # other directions carve sooner
-    low, size = middle - half, np.full(3, 2 * half)
+    low = middle - half
+    size = np.full(3, 2 * half)
     for count in (_COARSE_VOXELS, _FINE_VOXELS):
         side = size / count
         middle = low + size / 2
@@ -76,7 +77,8 @@ def visual_hull(cameras: Cameras, outlines: Sequence[Mask | None], middle: Float
             return None
         occupied = np.argwhere(filled)
         hull = VisualHull(low, side, filled)
-        low, size = low + (occupied.min(0) - 1) * side, (np.ptp(occupied, 0) + 3) * side
+        low = low + (occupied.min(0) - 1) * side
+        size = (np.ptp(occupied, 0) + 3) * side
     return hull
 
 
@@ -98,8 +100,10 @@ def _carve(views: Sequence[tuple[Float, Mask]], low: Float, side: Float, count: 
     filled = np.zeros((count, count * count), bool)
     plane = np.stack(np.meshgrid(steps, steps, indexing="ij"), -1).reshape(-1, 2) * side[1:] + low[1:]
     for slab, x in enumerate(low[0] + steps * side[0]):
-        points, left = plane, np.arange(len(plane))
-        empty, seen = np.zeros(len(plane), np.int16), np.zeros(len(plane), np.int16)
+        points = plane
+        left = np.arange(len(plane))
+        empty = np.zeros(len(plane), np.int16)
+        seen = np.zeros(len(plane), np.int16)
         for P, shown in views:
             ahead = points @ P[:, 1:3].T + (P[:, 0] * x + P[:, 3])
             depth = np.maximum(ahead[:, 2], 1e-9)
@@ -110,7 +114,10 @@ def _carve(views: Sequence[tuple[Float, Mask]], low: Float, side: Float, count: 
             empty += inside & ~hit
             kept = empty <= _EMPTY_VIEWS_SHARE * len(views)
             if not kept.all():
-                points, left, empty, seen = points[kept], left[kept], empty[kept], seen[kept]
+                points = points[kept]
+                left = left[kept]
+                empty = empty[kept]
+                seen = seen[kept]
         filled[slab, left] = seen >= _SEEING_VIEWS_SHARE * len(views)
     return filled.reshape(count, count, count)
 

@@ -90,7 +90,8 @@ def points_along_rays(
         raise InputError(
             f"view {bare[0]} has no photo", hint="pass views with photos, their {images=DIR}, or a scene"
         )
-    photos, outlines = list[_Photo](), list[Mask | None]()
+    photos = list[_Photo]()
+    outlines = list[Mask | None]()
     for view in range(len(cameras)):
         image, mask = load_photo(cameras, view, None)
         outline = image[..., 3] > 0.5 if image.shape[2] == 4 else None
@@ -102,7 +103,8 @@ def points_along_rays(
     distances = np.linalg.norm(cameras.positions - centre, axis=1)
     near = [_find_neighbours(cameras, i) for i in range(len(cameras))]
     hull = visual_hull(cameras, outlines, centre)
-    found, tried = Points(np.zeros((0, 3)), np.zeros((0, 3), np.float32)), 0
+    found = Points(np.zeros((0, 3)), np.zeros((0, 3), np.float32))
+    tried = 0
     while len(found) < count:
         if tried > 64 * max(count, _RAYS):
             raise InputError(
@@ -191,7 +193,8 @@ def _sweep(
         best = (cost <= cost.min(1, keepdims=True) + _EQUAL_COST_SLACK).argmax(
             1
         )  # the nearest is on the hull
-        depth, least = trial[rows, best], cost[rows, best]
+        depth = trial[rows, best]
+        least = cost[rows, best]
         kept = np.isfinite(least)
     else:
         finite = np.isfinite(cost)
@@ -251,7 +254,8 @@ class _Rays:
         others: NDArray[np.int64],
         pixels: NDArray[np.int64],
     ) -> _Rays:
-        photo, pose = shots[view].image, cameras.viewmats[view]
+        photo = shots[view].image
+        pose = cameras.viewmats[view]
         patch = _PATCH * shots[view].step
         rows = np.clip(pixels[0][:, None] + patch[:, 0], 0, photo.shape[0] - 1)
         columns = np.clip(pixels[1][:, None] + patch[:, 1], 0, photo.shape[1] - 1)
@@ -273,7 +277,8 @@ class _Rays:
         """Return (N, D) differences of the patches to the views that agree best; ∞ if too few see them."""
         own_costs = np.full((len(self.others), *depths.shape), np.inf)
         for k, other in enumerate(self.others):
-            total, inside = np.zeros(depths.shape), np.ones(depths.shape, bool)
+            total = np.zeros(depths.shape)
+            inside = np.ones(depths.shape, bool)
             for p in range(self.aims.shape[1]):
                 world = self.origin + self.aims[:, p : p + 1] * depths[..., None]
                 color, held = self._sampled(int(other), world)
@@ -285,14 +290,18 @@ class _Rays:
 
     def _sampled(self, view: int, world: Float) -> tuple[Float, Mask]:
         """Return the colours of world points in a photo, and whether it shows them; black if not."""
-        photo, valid = self.photos[view].image, self.photos[view].valid
-        pose, K = self.cameras.viewmats[view], self.cameras.Ks[view]
+        photo = self.photos[view].image
+        valid = self.photos[view].valid
+        pose = self.cameras.viewmats[view]
+        K = self.cameras.Ks[view]
         local = world @ pose[:3, :3].T + pose[:3, 3]
         ahead = local[..., 2] > 0
         depth = np.where(ahead, local[..., 2], 1.0)
         u = np.floor(K[0, 0] * local[..., 0] / depth + K[0, 2])
         v = np.floor(K[1, 1] * local[..., 1] / depth + K[1, 2])
         held = ahead & (u >= 0) & (v >= 0) & (u < photo.shape[1]) & (v < photo.shape[0])
-        rows, columns = np.where(held, v, 0).astype(int), np.where(held, u, 0).astype(int)
-        color, held = photo[rows, columns], held & valid[rows, columns]
+        rows = np.where(held, v, 0).astype(int)
+        columns = np.where(held, u, 0).astype(int)
+        color = photo[rows, columns]
+        held = held & valid[rows, columns]
         return np.where(held[..., None], color, 0.0), held
