@@ -97,7 +97,7 @@ def lost_detail(image: _Image, target: _Image, mask: NDArray[np.bool_] | None = 
     if not visible.any():
         return 0.0
     contrast = contrast[visible]
-    lost = np.maximum(contrast - common[visible] / contrast, 0)
+    lost = np.maximum((wanted - common)[visible] / contrast, 0)
     noticed = _SEEN_CONTRAST * (contrast / _SEEN_CONTRAST) ** _MASKING
     return float(np.quantile(lost / noticed, 0.99))
 
