@@ -99,7 +99,7 @@ def test_every_report_is_a_line() -> None:
     for path in (ROOT / "g2ard").rglob("*.py"):
         if "(Report):" in path.read_text(encoding="utf-8"):
             import_module(".".join(path.relative_to(ROOT).with_suffix("").parts))
-    reports = [cls for cls in Report.__subclasses__() if cls.__module__.startswith("g2ard.")]
+    reports = [cls for cls in descendants(Report) if cls.__module__.startswith("g2ard.")]
     own = {cls.__name__ for cls in reports if cls.__repr__ is not Report.__repr__}
     assert own == {"Evaluation", "RecoverReport"}
     for cls in reports:
@@ -109,6 +109,10 @@ def test_every_report_is_a_line() -> None:
         if cls.__name__ not in own:
             assert re.fullmatch(cls.__name__ + r"\(\w+=500 items(, \w+=500 items)*(, …)?\)", repr(full))
             assert len(repr(full)) < 120
+
+
+def descendants(cls: type) -> list[type]:
+    return [found for child in cls.__subclasses__() for found in (child, *descendants(child))]
 
 
 def test_a_camera_shows_its_photo_or_its_frame(tmp_path: Path) -> None:
