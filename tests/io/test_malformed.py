@@ -22,7 +22,7 @@ from helpers.reader_cases import MAKERS, READ
 from helpers.view_files import orbit, transforms
 
 SAMPLED = 5
-"""Of so many malformed files one is read here, and all in `make fuzz`. No rule breaks 5, 10 or 15 things."""
+"""One malformed file in so many is read here, all in `make fuzz`. No rule breaks 5, 10 or 15 things."""
 
 
 @pytest.mark.filterwarnings("ignore")

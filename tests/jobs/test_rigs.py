@@ -17,7 +17,7 @@ from helpers.scenes import checkered_ball
 from helpers.view_files import edit, transforms
 
 WIDTH = 160
-"""Of a panorama; the others have as many pixels per radian in their middle."""
+"""Pixels of a panorama; the others have as many per radian in their middle."""
 SIDE, FOCAL = round(WIDTH / np.pi), WIDTH / (2 * np.pi)
 REACH = np.radians(100)
 """Angle from the axis that a fisheye sees."""

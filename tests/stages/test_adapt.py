@@ -150,7 +150,7 @@ def test_a_change_of_light_is_found_and_made() -> None:
 def test_an_unchanged_light_gives_the_identity() -> None:
     ball = checkered_ball(500)
     change = fit_colour_change(ball, TeacherRenders(ball, VIEWS), (0.0, 0.0, 0.0))
-    np.testing.assert_allclose(change.matrix, np.eye(3), atol=1e-6)
+    np.testing.assert_allclose(change.matrix, np.eye(3), atol=1e-5)  # targets have 16 bits
     assert adapt(ball, TeacherRenders(ball, VIEWS), AdaptConfig(steps=5)).report.colour_change is None
 
 
