@@ -58,7 +58,7 @@ _PANELS = {
         *("tolerance", "prior_views", "sh_degree"),
     ),
     "Output": (
-        *("output", "format", "keep", "page", "parents", "resume", "dry_run", "report"),
+        *("output", "format", "keep", "page", "parents", "resume", "dry_run", "report", "truth"),
         *("environment", "most", "extent", "least", "layout", "spz_version", "compress"),
         *("depth", "around", "fps"),
     ),

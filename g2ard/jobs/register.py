@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 from typing import Any, TypeVar
 
@@ -28,7 +28,7 @@ from g2ard.poses import plan_pool
 from g2ard.progress import Progress, Say, plural, silent, unsaid
 from g2ard.scene.cameras import Camera, Cameras
 from g2ard.scene.splats import Splats
-from g2ard.stages.register import RegisterConfig, Registered
+from g2ard.stages.register import PhotoReport, PoseError, RegisterConfig, Registered, pose_error
 from g2ard.stages.register import register as find_poses
 from g2ard.stages.register.config import ROUGH_FOCAL_SIGMA, STATED_FOCAL_SIGMA
 
@@ -42,7 +42,7 @@ _POSE_SAMPLE = 200_000
 @dataclass(frozen=True, eq=False)
 class RegisterJob:
     """A prepared registration: inputs are read and everything is decided. The fields are those of
-    `g2ard.stages.register.register`."""
+    `g2ard.stages.register.register`, and true poses by name."""
 
     scene: Splats
     photos: Cameras
@@ -52,9 +52,31 @@ class RegisterJob:
     keep: Keep
     background: Colour
     progress: Progress = silent
+    truth: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
 
     def run(self) -> Registered:
-        return find_poses(**vars(self))
+        """Find the poses, and compare them with the true ones."""
+        given = {name: value for name, value in vars(self).items() if name != "truth"}
+        found = find_poses(**given)
+        if not self.truth:
+            return found
+        photos = tuple(map(self._compare, found.report.photos))
+        return replace(found, report=replace(found.report, photos=photos))
+
+    def _compare(self, row: PhotoReport) -> PhotoReport:
+        """Add the errors of a photo's poses to its report."""
+        true = self.truth.get(row.name)
+        if true is None:
+            return row
+        start = self.starts.get(row.name)
+        if start is None and self.pool is not None and row.start is not None:
+            start = self.pool.viewmats[self.pool.names.index(row.start)]
+        end = row.camera_from_world
+        return replace(
+            row,
+            start_error=None if start is None else PoseError(*pose_error(start, true)),
+            error=None if end is None else PoseError(*pose_error(np.array(end), true)),
+        )
 
 
 @checks_arguments
@@ -64,6 +86,7 @@ def prepare(
     *,
     poses: Poses | str | Path | None = None,
     pool: Cameras | str | Path | int | None = None,
+    truth: Poses | str | Path | None = None,
     config: RegisterConfig | None = None,
     settings: Mapping[str, Any] | None = None,
     keep: Keep = "registered",
@@ -97,10 +120,11 @@ def prepare(
     if poses is None:
         poses = dict(zip(taken.names, taken.viewmats, strict=True)) if pool is None else {}
     starts = _named(poses, taken.names)
+    true = _named(truth or {}, taken.names)
     splats = load_scene(scene, say, render_model)
     propose_background(taken, background or BLACK, background is not None, say)
     places = pool if pool is None or isinstance(pool, Cameras) else pool_of(splats, pool, seed, progress, say)
-    return RegisterJob(splats, taken, starts, places, config, keep, background or BLACK, progress)
+    return RegisterJob(splats, taken, starts, places, config, keep, background or BLACK, progress, true)
 
 
 @signature_of(prepare)
@@ -119,6 +143,7 @@ def register(*inputs: Any, **options: Any) -> Registered:
             starts from the photos' own poses, unless there is a pool.
         pool: starting views for photos that are not in `poses`: cameras, their path, or a number of views to
             generate.
+        truth: true poses to compare with, given like `poses`; not used otherwise.
         config: options of registration; None means the defaults.
         settings: values of `config` by path, such as {"register.passes": 1}.
         keep: poses to keep: "registered", "uncertain" (both), or "all", which falls back to the start.

@@ -276,6 +276,7 @@ VALUES: dict[str, dict[str, str]] = {
         "passes": "1",
         "accept": "0.9",
         "keep": "registered",
+        "truth": "few.json --json told.json",
         "report": "other.html",
     },
     "info": {

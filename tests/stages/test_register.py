@@ -125,10 +125,14 @@ def test_the_command_writes_views(site: Path, command_line: CommandLine, tmp_pat
     common = ("--images", site / "photos", "--intrinsics", site / "truth.json", "--size", 128, "--json", "-")
     common = (*common, "--report", "page.html", "--set", "register.coarsest=32", "-o", "poses.json")
     arguments = ("register", site / "scene.ply", *common, "--poses", site / "coarse.txt")
+    arguments = (*arguments, "--truth", site / "truth.json")
     out, err = succeeds(command_line, tmp_path, *arguments)
     result = json.loads(out)
     assert result["summary"] == {"photos": 4, "registered": 4, "uncertain": 0, "refused": 0}
     assert len(result["photos"][0]["covariance"]) == 6
+    for row in result["photos"]:
+        assert row["error"]["position"] < 0.01 < row["start_error"]["position"]
+    assert "(median of 4) at the start" in err
     assert "4 of 4 photos" in err
     page = (tmp_path / "page.html").read_text()
     assert page.count('<section class="view">') == 4
@@ -150,6 +154,7 @@ def test_the_command_writes_views(site: Path, command_line: CommandLine, tmp_pat
         ("--images photos --focal 128", 1, "no initial pose; give --poses or --pool"),
         ("--images photos --focal 128 --poses other.txt", 1, "no pose has the name of a photo"),
         ("--images photos --intrinsics wide.json --poses coarse.txt", 1, "pass intrinsics with"),
+        ("--images views.json --truth other.txt", 1, "other.txt: no pose has the name of a photo"),
         ("--images views.json --focal 100", 1, "these views state their intrinsics"),
         ("--images views.json --keep some", 2, "keep"),
         ("--images views.json --report page.txt", 1, "ends in .html"),

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
+import numpy as np
 import typer
 
 from g2ard.cli import options as opt
@@ -14,6 +16,9 @@ from g2ard.config.choices import Keep, Refinement
 from g2ard.config.schema import listed
 from g2ard.errors import InputError
 from g2ard.progress import plural
+
+if TYPE_CHECKING:
+    from g2ard.stages.register import PoseError
 
 
 @command(
@@ -83,6 +88,9 @@ def register(
     keep: Annotated[
         Keep, typer.Option(help="Photos to write; with all, photos without a pose keep their initial one.")
     ] = "registered",
+    truth: Annotated[
+        Path | None, typer.Option(metavar="VIEWS", help="True poses to compare with; not used otherwise.")
+    ] = None,
     split: Annotated[str, typer.Option(metavar="train|test|all", help="Split of --images VIEWS.")] = "all",
     report: Annotated[
         Path | None,
@@ -113,6 +121,7 @@ def register(
         photos,
         poses=poses,
         pool=pool,
+        truth=truth,
         config=config,
         keep=keep,
         split=split,
@@ -129,6 +138,10 @@ def register(
     counts: dict[str, int] = {status: found.report.count(status) for status in KEPT["all"]}
     told = f"{plural(len(rows), 'photo')}: "
     told += ", ".join(f"{count} {status}" for status, count in counts.items())
+    if truth is not None:
+        before = _describe_median([row.start_error for row in rows])
+        after = _describe_median([row.error for row in rows])
+        told += f"; from --truth {before} at the start, {after} found"
     run.say(told)
     if len(found.cameras):
         run.write_views(output, found.cameras, format)
@@ -160,3 +173,11 @@ def register(
             "photos, such as the scene's training views",
         )
     run.say(f"{output}: {len(found.cameras)} of {plural(len(rows), 'photo')}")
+
+
+def _describe_median(errors: Sequence[PoseError | None]) -> str:
+    known = [(error.position, error.rotation) for error in errors if error is not None]
+    if not known:
+        return "none"
+    position, rotation = np.median(known, axis=0)
+    return f"{position:.3g} units / {rotation:.3g}° (median of {len(known)})"

@@ -54,6 +54,8 @@ class PhotoReport(Report):
         focal_sigma: σ of its logarithm.
         sigma: root of the covariance's trace for position, scene units, and rotation, degrees.
         camera_from_world: (4, 4) result; None if there is none.
+        start_error: error of the starting pose; None without one, or without a true pose.
+        error: error of the result, likewise.
     """
 
     name: str
@@ -77,6 +79,8 @@ class PhotoReport(Report):
     renders: int = 0
     seconds: float = 0.0
     camera_from_world: tuple[tuple[float, ...], ...] | None = None
+    start_error: PoseError | None = None
+    error: PoseError | None = None
 
 
 @dataclass(frozen=True)
