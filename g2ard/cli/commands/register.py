@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from statistics import median
 from typing import TYPE_CHECKING, Annotated
 
-import numpy as np
 import typer
 
 from g2ard.cli import options as opt
@@ -179,5 +179,5 @@ def _describe_median(errors: Sequence[PoseError | None]) -> str:
     known = [(error.position, error.rotation) for error in errors if error is not None]
     if not known:
         return "none"
-    position, rotation = np.median(known, axis=0)
+    position, rotation = map(median, zip(*known, strict=True))
     return f"{position:.3g} units / {rotation:.3g}° (median of {len(known)})"
