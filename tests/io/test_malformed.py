@@ -22,7 +22,7 @@ from helpers.reader_cases import MAKERS, READ
 from helpers.view_files import orbit, transforms
 
 SAMPLED = 5
-"""One malformed file in so many is read here, all in `make fuzz`. No rule breaks 5, 10 or 15 things."""
+"""Every fifth malformed file is read here, each one in `make fuzz`. No rule breaks 5, 10 or 15 things."""
 
 
 @pytest.mark.filterwarnings("ignore")
