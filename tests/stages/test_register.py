@@ -132,7 +132,7 @@ def test_the_command_writes_views(site: Path, command_line: CommandLine, tmp_pat
     assert len(result["photos"][0]["covariance"]) == 6
     for row in result["photos"]:
         assert row["error"]["position"] < 0.01 < row["start_error"]["position"]
-    assert "(median of 4) at the start" in err
+    assert "of 4 photos at the start" in " ".join(err.split())
     assert "4 of 4 photos" in err
     page = (tmp_path / "page.html").read_text()
     assert page.count('<section class="view">') == 4

@@ -141,7 +141,7 @@ def register(
     if truth is not None:
         before = _describe_median([row.start_error for row in rows])
         after = _describe_median([row.error for row in rows])
-        told += f"; from --truth {before} at the start, {after} found"
+        told += f"; median error against --truth: {before} at the start, {after} found"
     run.say(told)
     if len(found.cameras):
         run.write_views(output, found.cameras, format)
@@ -180,4 +180,4 @@ def _describe_median(errors: Sequence[PoseError | None]) -> str:
     if not known:
         return "none"
     position, rotation = map(median, zip(*known, strict=True))
-    return f"{position:.3g} units / {rotation:.3g}° (median of {len(known)})"
+    return f"{position:.3g} units / {rotation:.3g}° of {plural(len(known), 'photo')}"
