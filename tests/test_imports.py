@@ -13,6 +13,7 @@ ROOT = Path(g2ard.__file__).parent
 
 LAYERS = (
     "_core",
+    "arrays",
     "errors",
     "progress",
     "system",
