@@ -7,10 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
+from g2ard.arrays import Float
 from g2ard.io.colmap import parsing
 from g2ard.io.frames import Frame, Lens, Listed, make_pose, make_view_set
 from g2ard.io.photo_headers import read_size
-from g2ard.io.types import Float, ViewSet
+from g2ard.io.types import ViewSet
 
 __all__ = ["read"]
 

@@ -12,9 +12,10 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
+from g2ard.arrays import Bytes
 from g2ard.errors import InputError, MissingDependencyError
 from g2ard.io.atomic import atomic_output
-from g2ard.io.types import Bytes, Size
+from g2ard.io.types import Size
 
 ANIMATIONS = (".gif", ".webp", ".mp4")
 

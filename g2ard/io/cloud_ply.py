@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 from numpy.lib.recfunctions import unstructured_to_structured
 
+from g2ard.arrays import Float32, Values
 from g2ard.errors import InputError
 from g2ard.io.judge import full_scales, unpack_colors
 from g2ard.io.plyfiles import (
@@ -21,7 +22,7 @@ from g2ard.io.plyfiles import (
 )
 from g2ard.io.signs import MESH
 from g2ard.io.stream import MarkedPoints, Names, PointStream, telling
-from g2ard.io.types import Float32, Points, Values
+from g2ard.io.types import Points
 
 _POSITION = ["x", "y", "z"]
 

@@ -6,12 +6,12 @@ from pathlib import Path
 
 import numpy as np
 
+from g2ard.arrays import Float
 from g2ard.errors import InputError, damaged
 from g2ard.io.judge import full_scales, unpack_colors
 from g2ard.io.paths import decoded, plain_numbers, read_text
 from g2ard.io.signs import is_table
 from g2ard.io.stream import HeldPoints
-from g2ard.io.types import Float
 
 _COLUMNS = {
     "x": r"x|x_coord\w*|east\w*",

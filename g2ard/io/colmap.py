@@ -13,13 +13,14 @@ from typing import Any, NamedTuple, Self
 
 import numpy as np
 
+from g2ard.arrays import Float
 from g2ard.errors import InputError, damaged
 from g2ard.io.finding import Finder, files_in
 from g2ard.io.frames import Frame, Lens, Listed, make_pose
 from g2ard.io.jsonfile import Place
 from g2ard.io.paths import about, read_text
 from g2ard.io.transforms import intrinsics_of
-from g2ard.io.types import Float, ViewFiles
+from g2ard.io.types import ViewFiles
 from g2ard.progress import plural
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.lenses import PARAMETERS, PhotoLens

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 from numpy.lib.recfunctions import structured_to_unstructured, unstructured_to_structured
-from numpy.typing import NDArray
 
+from g2ard.arrays import Float, Float32, Values
 from g2ard.config.choices import RenderModel
 from g2ard.errors import InputError
 from g2ard.io.atomic import atomic_output
@@ -37,7 +37,6 @@ from g2ard.io.plyfiles import (
 )
 from g2ard.io.sanitize import Raw, logits_of
 from g2ard.io.stream import RawStream
-from g2ard.io.types import Float, Float32, Values
 from g2ard.progress import plural
 from g2ard.scene.splats import SH_C0, Splats
 from g2ard.scene.transform import as_stored
@@ -173,7 +172,7 @@ def _within(values: Values) -> tuple[Float32, Float]:
     return np.stack(ends, axis=1), (values - low) / np.where(wide > 0, wide, 1.0)
 
 
-def _packed(values: Float, bits: tuple[int, ...]) -> NDArray[np.uint32]:
+def _packed(values: Float, bits: tuple[int, ...]) -> Values:
     """Pack (N, C) in [0, 1] into words, the first column in the highest bits."""
     word = np.zeros(len(values), np.uint32)
     for k, width in enumerate(bits):

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from g2ard.arrays import Values
 from g2ard.config.choices import colour_text
 from g2ard.io import Source, read_view_set
 from g2ard.io.detect import run_scene
@@ -14,7 +15,7 @@ from g2ard.io.jsonfile import Json
 from g2ard.io.photos import measure_traits
 from g2ard.io.sog import chunks_of
 from g2ard.io.splits import splits_of
-from g2ard.io.types import Note, Points, Values, ViewFiles, ViewSet
+from g2ard.io.types import Note, Points, ViewFiles, ViewSet
 from g2ard.progress import plural
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.shape import elongation

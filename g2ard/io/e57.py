@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from g2ard.arrays import Float
 from g2ard.errors import G2ardError, InputError, missing
 from g2ard.io.atomic import atomic_output
 from g2ard.io.frames import Frame, Lens, Listed, invert_pose, make_pose
@@ -18,7 +19,7 @@ from g2ard.io.judge import full_scales
 from g2ard.io.paths import check_unpacked, file_identity, user_cache
 from g2ard.io.stream import JoinedClouds, MarkedPoints, Names, PointStream, telling
 from g2ard.io.transforms import FLIP
-from g2ard.io.types import Float, Note, Notes, ViewFiles
+from g2ard.io.types import Note, Notes, ViewFiles
 from g2ard.progress import plural
 from g2ard.scene.lenses import PhotoLens
 from g2ard.scene.transform import rotation_matrices

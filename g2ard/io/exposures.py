@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
+from g2ard.arrays import Float
 from g2ard.io.jsonfile import Place, Row, checked, read_json
-from g2ard.io.types import Float
 from g2ard.scene.cameras import Cameras
 
 

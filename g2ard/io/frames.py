@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from g2ard.arrays import Float
 from g2ard.errors import InputError
 from g2ard.io.finding import (
     Finder,
@@ -33,7 +34,7 @@ from g2ard.io.photo_headers import (
     orientation,
     swap_sides,
 )
-from g2ard.io.types import Float, Note, Notes, Size, ViewSet
+from g2ard.io.types import Note, Notes, Size, ViewSet
 from g2ard.progress import plural
 from g2ard.scene.cameras import USUAL, Cameras
 from g2ard.scene.lenses import PhotoLens

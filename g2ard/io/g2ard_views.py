@@ -9,12 +9,13 @@ import msgspec
 import numpy as np
 from numpy.typing import ArrayLike
 
+from g2ard.arrays import Float
 from g2ard.errors import InputError
 from g2ard.io.finding import Finder
 from g2ard.io.frames import Frame, Lens, Listed, make_rigid
 from g2ard.io.jsonfile import Json, Matrix, Number, Place, Pose, Weight, Whole, checked, read_own
 from g2ard.io.paths import beside
-from g2ard.io.types import Float, Splits, ViewFiles
+from g2ard.io.types import Splits, ViewFiles
 from g2ard.progress import plural
 from g2ard.scene.cameras import USUAL, Cameras
 from g2ard.scene.lenses import PARAMETERS, PhotoLens

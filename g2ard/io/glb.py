@@ -21,6 +21,7 @@ import msgspec
 import numpy as np
 
 import g2ard.io.spz as spz
+from g2ard.arrays import Float, Float32, Values
 from g2ard.config.choices import AXES, Axes
 from g2ard.errors import InputError, damaged, require
 from g2ard.io.atomic import atomic_output
@@ -30,7 +31,7 @@ from g2ard.io.packing import packing_order, rounding, unit_quats, writable
 from g2ard.io.paths import check_regular, decoded
 from g2ard.io.sanitize import Raw, cleaned
 from g2ard.io.signs import MESH, SCAN
-from g2ard.io.types import Float, Float32, Note, Noted, Values
+from g2ard.io.types import Note, Noted
 from g2ard.progress import plural
 from g2ard.scene.splats import SH_C0, Splats
 from g2ard.scene.transform import (

@@ -9,9 +9,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 from PIL import Image
 
+from g2ard.arrays import Bytes, Float32
 from g2ard.errors import InputError
 from g2ard.io.atomic import atomic_output
-from g2ard.io.types import Bytes, Float32, Size
+from g2ard.io.types import Size
 
 
 def resize(image: Float32, size: Size) -> Float32:

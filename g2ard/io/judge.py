@@ -7,8 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from g2ard.arrays import Float, Values
 from g2ard.io.sanitize import Raw, logits_of
-from g2ard.io.types import Float, Note, Notes, Values
+from g2ard.io.types import Note, Notes
 from g2ard.progress import plural
 from g2ard.scene.splats import SH_C0
 

@@ -5,9 +5,10 @@ from typing import Any
 
 import numpy as np
 
+from g2ard.arrays import Float, Values
 from g2ard.errors import InputError, damaged
 from g2ard.io.sanitize import Raw, cleaned
-from g2ard.io.types import Float, Noted, Values
+from g2ard.io.types import Noted
 from g2ard.scene.splats import SH_C0
 
 _HEADER = 4096  # bytes of the file's header

@@ -10,11 +10,12 @@ import numpy as np
 
 import g2ard.io.colmap as colmap
 import g2ard.io.transforms as transforms
+from g2ard.arrays import Float
 from g2ard.errors import InputError
 from g2ard.io.frames import Frame, Listed, invert_pose, make_rigid
 from g2ard.io.jsonfile import Place, Pose, Positive, checked, read_json
 from g2ard.io.trainer_yaml import Settings, below, read_settings
-from g2ard.io.types import Float, ViewFiles
+from g2ard.io.types import ViewFiles
 from g2ard.scene.samples import evenly_spaced
 
 NAME = "dataparser_transforms.json"

@@ -4,12 +4,11 @@ from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from g2ard.arrays import Bytes, Float, Int, Rows, Values
 from g2ard.errors import InputError
 from g2ard.io.jsonfile import Json
 from g2ard.io.sanitize import LOG_SCALE_LIMIT
-from g2ard.io.types import Bytes, Float, Values
 from g2ard.scene.splats import Splats
 from g2ard.scene.transform import as_stored, moved_axes
 
@@ -66,7 +65,7 @@ def as_packed(path: Path, splats: Splats) -> Splats:
     return form
 
 
-def packing_order(means: Values, chunk: int = 1) -> NDArray[np.intp]:
+def packing_order(means: Values, chunk: int = 1) -> Rows:
     """Return rows by shells of distance from the median, and in Morton order within a shell.
 
     Rows up to four times the 75th percentile of the distances are one shell, and each doubling beyond is
@@ -88,7 +87,7 @@ def packing_order(means: Values, chunk: int = 1) -> NDArray[np.intp]:
     return np.concatenate([rows[morton_order(means[rows])] for rows in groups])
 
 
-def morton_order(means: Values) -> NDArray[np.intp]:
+def morton_order(means: Values) -> Rows:
     """Return rows in Morton order (2²¹ cells per axis, ties by row)."""
     low = means.min(axis=0).astype(float)
     high = means.max(axis=0).astype(float)
@@ -100,7 +99,7 @@ def morton_order(means: Values) -> NDArray[np.intp]:
     return np.argsort(code, kind="stable")
 
 
-def _spread(v: NDArray[np.uint64]) -> NDArray[np.uint64]:
+def _spread(v: Values) -> Values:
     for shift, mask in (
         (32, 0x001F00000000FFFF),
         (16, 0x001F0000FF0000FF),
@@ -127,7 +126,7 @@ def unit_quats(quats: Values) -> Float:
     return np.where(norms > 0, q / np.maximum(norms, 0.5), [1.0, 0, 0, 0])
 
 
-def smallest_three(quats: Float) -> tuple[NDArray[np.intp], Float]:
+def smallest_three(quats: Float) -> tuple[Rows, Float]:
     """Return the index of each unit quaternion's largest component, and the other three.
 
     The sign is chosen so that the largest is positive; the others are within ±1/√2.
@@ -156,6 +155,6 @@ def as_bytes(values: Values) -> Bytes:
     return np.clip(np.rint(values), 0, 255).astype(np.uint8)
 
 
-def coded(values: Values, top: int) -> NDArray[np.int64]:
+def coded(values: Values, top: int) -> Int:
     """Round values in [0, 1] to integers in 0 … top."""
     return np.clip(np.rint(values * top), 0, top).astype(np.int64)

@@ -13,10 +13,11 @@ from typing import Any
 import numpy as np
 from PIL import Image, ImageCms, ImageOps
 
+from g2ard.arrays import Float32, Values
 from g2ard.errors import InputError
 from g2ard.io.finding import files_in
 from g2ard.io.photo_headers import needs_turn, open_image
-from g2ard.io.types import Float32, Size, Values
+from g2ard.io.types import Size
 from g2ard.scene.samples import evenly_spaced
 
 

@@ -11,13 +11,14 @@ from pathlib import Path
 
 import numpy as np
 
+from g2ard.arrays import Float, Float32, Mask
 from g2ard.config.choices import BLACK, Colour
 from g2ard.errors import InputError
 from g2ard.io.finding import MOVING
 from g2ard.io.images import resize
 from g2ard.io.photo_decoding import decode_photo
 from g2ard.io.photo_headers import have_same_aspect, open_image, read_size
-from g2ard.io.types import Float, Float32, Mask, Size
+from g2ard.io.types import Size
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.lenses import PhotoLens
 from g2ard.scene.samples import evenly_spaced

@@ -8,13 +8,14 @@ import numpy as np
 from numpy.lib.recfunctions import structured_to_unstructured
 
 import g2ard.io.plyfiles as plyfiles
+from g2ard.arrays import Float, Float32, Values
 from g2ard.config.choices import PlyLayout, RenderModel
 from g2ard.errors import InputError, require
 from g2ard.io.judge import Reading, choose_white, full_scales, judge_storage, note_coarse, spacing
 from g2ard.io.packing import rounding
 from g2ard.io.sanitize import BLOCK, LOG_SCALE_LIMIT, Raw
 from g2ard.io.stream import RawStream, SceneStream
-from g2ard.io.types import Float, Float32, Note, Values
+from g2ard.io.types import Note
 from g2ard.progress import plural, some
 from g2ard.scene.splats import SH_C0, Splats, far_middle, unit_quats
 from g2ard.scene.transform import as_stored

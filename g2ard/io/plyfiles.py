@@ -11,12 +11,12 @@ from typing import Literal
 import numpy as np
 from plyfile import PlyData, PlyElement, PlyElementParseError, PlyListProperty, PlyParseError
 
+from g2ard.arrays import Float, Values
 from g2ard.config.choices import AXES, Axes, RenderModel
 from g2ard.errors import InputError, damaged
 from g2ard.io.atomic import atomic_output
 from g2ard.io.paths import about, plain_numbers
 from g2ard.io.signs import AGAIN
-from g2ard.io.types import Float, Values
 from g2ard.scene.splats import Splats
 from g2ard.scene.transform import moved_axes
 

@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
+from g2ard.arrays import Float
 from g2ard.errors import InputError, damaged
 from g2ard.io.colmap import Columns, Table, TextTable, model_folder, numbers_of, parsing, points_file
 from g2ard.io.jsonfile import Place
 from g2ard.io.stream import HeldPoints
-from g2ard.io.types import Float
 
 _POINT = Columns.of("QdddBBBdQ", "POINT3D_ID", *"XYZRGB", "ERROR", "TRACK")
 _NUMBERS = Columns.of("ddddddd", "POINT3D_ID", *"XYZRGB")

@@ -8,9 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
+from g2ard.arrays import Float, Float32, Mask, Values
 from g2ard.config.choices import RenderModel
 from g2ard.errors import InputError
-from g2ard.io.types import Float, Float32, Mask, Note, Noted, Values
+from g2ard.io.types import Note, Noted
 from g2ard.progress import plural
 from g2ard.scene.splats import DRAWN_LOGIT, Splats
 

@@ -20,6 +20,7 @@ import numpy as np
 from msgspec import UNSET, UnsetType
 from PIL.Image import Image
 
+from g2ard.arrays import Bytes, Float32, Values
 from g2ard.config.choices import Axes, RenderModel
 from g2ard.errors import InputError, damaged
 from g2ard.io.jsonfile import FileName, Place, Vector, Whole, checked, parse_json, read_json
@@ -28,7 +29,7 @@ from g2ard.io.paths import check_regular, check_unpacked, decoded, file_identity
 from g2ard.io.photo_headers import open_image
 from g2ard.io.sanitize import BLOCK, Raw, logits_of
 from g2ard.io.stream import RawStream, from_row, ranges
-from g2ard.io.types import Bytes, Float32, Note, Values
+from g2ard.io.types import Note
 from g2ard.progress import plural
 from g2ard.scene.transform import moved_axes, one_model
 

@@ -16,10 +16,10 @@ import zipfile
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 import g2ard._core as _core
 from g2ard._core import __version__
+from g2ard.arrays import Bytes, Float, Float32, Int, Rows, Values
 from g2ard.errors import InputError
 from g2ard.io.atomic import atomic_folder, atomic_output
 from g2ard.io.packing import (
@@ -32,7 +32,7 @@ from g2ard.io.packing import (
     unit_quats,
     writable,
 )
-from g2ard.io.types import Bytes, Float, Float32, Size, Values
+from g2ard.io.types import Size
 from g2ard.progress import Progress, silent
 from g2ard.scene.shape import longer_axes
 from g2ard.scene.splats import Splats
@@ -162,7 +162,7 @@ def _webp(pixels: Bytes) -> bytes:
     return buffer.getvalue()
 
 
-def _means(splats: Splats) -> tuple[Float, Float, NDArray[np.int64]]:
+def _means(splats: Splats) -> tuple[Float, Float, Int]:
     """Return the bounds of the logarithms per axis, and (N, 3) 16-bit codes between them."""
     means = splats.means.astype(float)
     logs = np.sign(means) * np.log1p(np.abs(means))
@@ -171,14 +171,14 @@ def _means(splats: Splats) -> tuple[Float, Float, NDArray[np.int64]]:
     return low, high, coded((logs - low) / np.where(high > low, high - low, 1.0), 65535)
 
 
-def _numbers(values: Values) -> tuple[Float32, NDArray[np.intp]]:
+def _numbers(values: Values) -> tuple[Float32, Rows]:
     """Return a codebook of 256 entries, and the nearest entry of every value."""
     values = np.ascontiguousarray(values, np.float32)
     book = _core.codebook(values.ravel(), 256)
     return book, nearest(book, values)
 
 
-def nearest(book: Float32, values: Float32) -> NDArray[np.intp]:
+def nearest(book: Float32, values: Float32) -> Rows:
     """Return the entry of an ascending codebook nearest to each value."""
     wide = book.astype(float)
     return np.searchsorted((wide[1:] + wide[:-1]) / 2, values)
@@ -195,7 +195,7 @@ def _weights(splats: Splats) -> Float32:
     return (shown / mean if mean > 0 else np.ones(len(splats))).astype(np.float32)
 
 
-def _rest(splats: Splats) -> tuple[int, Float32, Bytes, NDArray[np.uint32]]:
+def _rest(splats: Splats) -> tuple[int, Float32, Bytes, Values]:
     """Return the palette's size, codebook and image, and the (N,) entries of Gaussians."""
     rest = splats.shN.shape[1]
     points = np.ascontiguousarray(splats.shN.reshape(len(splats), 3 * rest))

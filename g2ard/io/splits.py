@@ -6,12 +6,13 @@ from typing import Any
 
 import numpy as np
 
+from g2ard.arrays import Mask
 from g2ard.errors import InputError
 from g2ard.io.colmap import model_folder
 from g2ard.io.finding import usable
 from g2ard.io.jsonfile import read_json
 from g2ard.io.paths import content_hash, read_text, real_path
-from g2ard.io.types import Mask, Splits
+from g2ard.io.types import Splits
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.lenses import photo_of
 

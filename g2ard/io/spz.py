@@ -16,9 +16,9 @@ from typing import Any
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 import g2ard.io.packing as packing
+from g2ard.arrays import Bytes, Float, Values
 from g2ard.config.choices import Axes
 from g2ard.errors import InputError, damaged, missing, require
 from g2ard.io.atomic import atomic_output
@@ -26,7 +26,7 @@ from g2ard.io.jsonfile import Place as JsonPlace
 from g2ard.io.jsonfile import Vector, checked, parse_json
 from g2ard.io.paths import about, check_unpacked
 from g2ard.io.sanitize import Raw, cleaned, logits_of
-from g2ard.io.types import Bytes, Float, Note, Noted, Values
+from g2ard.io.types import Note, Noted
 from g2ard.progress import Progress, plural, silent, some
 from g2ard.scene.splats import Splats
 from g2ard.scene.transform import change_of_axes, harmonic_signs, moved_axes, restored, with_axes
@@ -246,7 +246,7 @@ def _unpacked(frame: bytes, size: int) -> bytes:
         raise damaged(f"broken Zstandard stream ({error})") from error
 
 
-def _fixed24(triples: Bytes) -> NDArray[np.int32]:
+def _fixed24(triples: Bytes) -> Values:
     """Decode signed 24-bit little-endian integers."""
     wide = np.zeros((len(triples), 4), np.uint8)
     wide[:, 1:] = triples

@@ -13,12 +13,13 @@ from typing import Any, Generic, Literal, NamedTuple, Self, TypeVar
 
 import numpy as np
 
+from g2ard.arrays import Float, Float32, Mask, Values
 from g2ard.config.choices import Axes, RenderModel
 from g2ard.errors import InputError
 from g2ard.io.judge import HDR, choose_shades, choose_white, has_contrast, note_coarse, spacing
 from g2ard.io.paths import file_identity
 from g2ard.io.sanitize import BLOCK, Raw, Tally
-from g2ard.io.types import Cloud, Float, Float32, Mask, Note, Notes, Points, Values
+from g2ard.io.types import Cloud, Note, Notes, Points
 from g2ard.progress import plural
 from g2ard.scene.splats import ARRAYS, Splats
 from g2ard.scene.transform import change_of_axes, common_axes, one_model, restored, stand_as

@@ -15,8 +15,8 @@ from typing import Annotated, Any
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
+from g2ard.arrays import Float, Float32, Values
 from g2ard.config.choices import Axes, RenderModel
 from g2ard.errors import InputError
 from g2ard.io.detect import MANIFEST
@@ -24,7 +24,7 @@ from g2ard.io.jsonfile import Number, Place, Vector, Whole, checked, read_own
 from g2ard.io.paths import about
 from g2ard.io.sanitize import Raw
 from g2ard.io.stream import PartsStream
-from g2ard.io.types import Float, Float32, Notes
+from g2ard.io.types import Notes
 from g2ard.scene.kdtree import KdTree
 from g2ard.scene.splats import Splats
 
@@ -292,7 +292,7 @@ class TileStore:
             self.check(tile.index)
             yield self.rows(tile.index)[:, :3]
 
-    def take(self, index: NDArray[np.integer]) -> Splats:
+    def take(self, index: Values) -> Splats:
         """Return rows by number, counted tile after tile."""
         index = np.asarray(index)
         starts = np.cumsum([0, *(tile.rows for tile in self.tiles)])

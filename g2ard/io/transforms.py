@@ -10,13 +10,14 @@ import msgspec
 import numpy as np
 from msgspec import UNSET, UnsetType
 
+from g2ard.arrays import Float
 from g2ard.errors import InputError
 from g2ard.io.finding import Finder, is_end
 from g2ard.io.frames import Frame, Lens, Listed, invert_pose, make_rigid
 from g2ard.io.jsonfile import Json, Number, Place, Pose, Vector, Whole, checked, read_json
 from g2ard.io.paths import beside
 from g2ard.io.photo_headers import have_same_aspect, read_size
-from g2ard.io.types import Float, Note, Notes, Size, Splits, ViewFiles
+from g2ard.io.types import Note, Notes, Size, Splits, ViewFiles
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.lenses import PhotoLens
 

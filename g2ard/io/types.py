@@ -5,23 +5,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from g2ard.arrays import Float, Float32, Mask
 from g2ard.config.choices import Alpha, Axes
 from g2ard.errors import InputError
 from g2ard.progress import plural
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats, unit_colors
-
-Values = NDArray[Any]
-Float = NDArray[np.float64]
-Float32 = NDArray[np.float32]
-Bytes = NDArray[np.uint8]
-Mask = NDArray[np.bool_]
-"""Arrays of numbers of any type, and of the usual types."""
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ from typing import Any, TextIO
 
 import numpy as np
 
+from g2ard.arrays import Float, Float32
 from g2ard.config.choices import AXES
 from g2ard.errors import InputError, OutputError, missing
 from g2ard.io.atomic import atomic_output
@@ -21,7 +22,7 @@ from g2ard.io.packing import rounding, unit_quats, writable
 from g2ard.io.sanitize import Raw, cleaned
 from g2ard.io.signs import MESH, SCAN
 from g2ard.io.spz import FLIPS
-from g2ard.io.types import Float, Float32, Note, Noted
+from g2ard.io.types import Note, Noted
 from g2ard.progress import Progress, plural, silent
 from g2ard.scene.splats import SH_C0, Splats
 from g2ard.scene.transform import as_stored, restored

@@ -11,6 +11,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from g2ard.arrays import Float32
 from g2ard.config.choices import PointColor
 from g2ard.config.schema import Settings
 from g2ard.errors import InputError, require
@@ -18,7 +19,7 @@ from g2ard.io import Source
 from g2ard.io.judge import choose_shades
 from g2ard.io.sanitize import Tally
 from g2ard.io.stream import JoinedClouds, MarkedPoints, PointStream, from_row, ranges
-from g2ard.io.types import Float32, Note, Notes, Points
+from g2ard.io.types import Note, Notes, Points
 from g2ard.progress import Progress, silent
 from g2ard.scene.conditions import holds, names_in
 from g2ard.scene.splats import Splats

@@ -6,12 +6,12 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
+from g2ard.arrays import Float
 from g2ard.errors import InputError
 from g2ard.io.frames import invert_pose, make_pose, make_rigid
 from g2ard.io.jsonfile import Place
 from g2ard.io.paths import read_text
 from g2ard.io.signs import sign_of
-from g2ard.io.types import Float
 
 _UNITS = 10.0 ** np.arange(-9, 10, 3)  # of times, in units of the names of photos
 

@@ -18,9 +18,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from g2ard._core import __version__
+from g2ard.arrays import Float, Int
 from g2ard.config.checks import checks_arguments
 from g2ard.errors import InputError
 from g2ard.io.atomic import atomic_folder, drop_empty, drop_temporaries
@@ -162,13 +162,13 @@ class _Files:
 
     levels: Sequence[Level]
     most: int
-    parts: dict[str, list[NDArray[np.int64]]]
+    parts: dict[str, list[Int]]
     rounding: Rounding
     error: float
     level_of: dict[str, int] = field(default_factory=dict)
     last: dict[int, tuple[str, int]] = field(default_factory=dict)
 
-    def place(self, level: int, rows: NDArray[np.int64]) -> dict[str, int]:
+    def place(self, level: int, rows: Int) -> dict[str, int]:
         """Append a leaf's rows and return their file, offset and count."""
         name, filled = self.last.get(level, ("", self.most + 1))
         if filled > self.most:
@@ -206,7 +206,7 @@ def _describe_node(tree: Node, files: _Files) -> dict[str, Any]:
     return {**node, "lods": placed}
 
 
-def _round(values: Sequence[float] | NDArray[np.float64]) -> list[float]:
+def _round(values: Sequence[float] | Float) -> list[float]:
     """Round to seven digits, the precision of float32."""
     return [float(f"{float(value):.7g}") for value in values]
 

@@ -13,9 +13,10 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from g2ard._core import __version__
+from g2ard.arrays import Float, Int
 from g2ard.config.checks import Finite, Within
 from g2ard.config.schema import Settings
 from g2ard.errors import InputError, missing
@@ -31,8 +32,6 @@ from g2ard.progress import Progress, silent
 from g2ard.scene.shape import longer_axes
 from g2ard.scene.splats import Splats
 from g2ard.scene.transform import unit_up
-
-Float = NDArray[np.float64]
 
 TILE_OF_SCENE = np.array([[-1.0, 0, 0], [0, 0, -1], [0, -1, 0]])
 """Rotation from the scene's axes to a tile's: glTF's (half a turn about z), then z up instead of y."""
@@ -73,7 +72,7 @@ class Georeference(Settings):
         """
         import pyproj
 
-        east, north, height = np.asarray(offset, np.float64).tolist()
+        east, north, height = np.asarray(offset, float).tolist()
         if len(system.axis_info) == 2:  # heights of such a system are metres to pyproj
             height *= metres_of(system)
         to_globe = pyproj.Transformer.from_crs(system, "EPSG:4979", always_xy=True)
@@ -185,7 +184,7 @@ def check_tiles(path: Path, splats: Splats, ratio: float, cut: Cut | None = None
     """
     if len(splats) > ratio * (cut or Cut()).most:
         return
-    means = splats.means.astype(np.float64)
+    means = splats.means.astype(float)
     middle = np.rint((means.min(axis=0) + means.max(axis=0)) / 2)
     check_far(path, splats, means - middle, ratio**0.5, movable=True)
 
@@ -208,7 +207,7 @@ class _Tiles:
     path: Path
     rounding: Rounding
     error: float
-    files: dict[str, tuple[int, list[NDArray[np.int64]], Float]] = field(default_factory=dict)
+    files: dict[str, tuple[int, list[Int], Float]] = field(default_factory=dict)
 
     def of(self, node: Node, level: int) -> list[dict[str, Any]]:
         """Return tiles that together show a level, or finer ones where it is empty, and all below it."""
@@ -227,10 +226,10 @@ class _Tiles:
         self.files[name] = level, rows, (node.low + node.high) / 2
         return [_describe_tile(node, error, finer) | {"content": {"uri": name}}]
 
-    def _error(self, level: int, rows: list[NDArray[np.int64]]) -> float:
+    def _error(self, level: int, rows: list[Int]) -> float:
         """Return 16 standard deviations of the median Gaussian, along its two longer axes."""
         scales = longer_axes(self.levels[level].take(np.concatenate(rows)).scales)
-        return _SCREEN_SPACE_ERROR * float(np.median(np.sqrt(scales.astype(np.float64).prod(axis=1))))
+        return _SCREEN_SPACE_ERROR * float(np.median(np.sqrt(scales.astype(float).prod(axis=1))))
 
     def content(self, name: str) -> list[bytes]:
         """Return the .glb of a tile, whose node is moved to the middle of its box."""

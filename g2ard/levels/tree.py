@@ -9,8 +9,8 @@ from tempfile import TemporaryFile
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from g2ard.arrays import Float, Int, Values
 from g2ard.config.checks import AtLeastOne, Positive
 from g2ard.config.schema import Settings
 from g2ard.errors import InputError
@@ -22,8 +22,6 @@ from g2ard.scene.transform import rotation_matrices
 Level = Splats | TileStore
 """A level of detail: a scene in memory, or rows on disk."""
 
-Float = NDArray[np.float64]
-Rows = NDArray[np.int64]
 
 _ROWS_AT_ONCE = 1 << 20  # rows processed together
 
@@ -57,7 +55,7 @@ class Node:
     low: Float
     high: Float
     children: tuple[Node, ...] = ()
-    rows: tuple[Rows, ...] = ()
+    rows: tuple[Int, ...] = ()
 
     def leaves(self) -> Iterator[Node]:
         """Yield all leaves, in tree order."""
@@ -77,7 +75,7 @@ def aligned(levels: Sequence[Level]) -> tuple[list[Level], float, bool]:
     error = 0.0
     for level in levels:
         near = level
-        if isinstance(level, Splats) and (moved or level.means.dtype == np.float64):
+        if isinstance(level, Splats) and (moved or level.means.dtype == float):
             near = level.narrowed(offset)
             error = max(error, rounding(level, near))
         found.append(near)
@@ -126,7 +124,7 @@ def _split_rows(count: int) -> Iterator[slice]:
 def _measure_reach(splats: Splats) -> Float:
     """Return the (N, 3) half extents of each Gaussian's 1σ box, |R|·s."""
     frames = rotation_matrices(splats.quats)
-    return np.einsum("nij,nj->ni", np.abs(frames), splats.scales.astype(np.float64))
+    return np.einsum("nij,nj->ni", np.abs(frames), splats.scales.astype(float))
 
 
 class _Tree:
@@ -141,8 +139,8 @@ class _Tree:
         at = 0
         self.kept = self.room(count)
         self.filled = 0
-        wide = any(isinstance(level, Splats) and level.means.dtype == np.float64 for level in levels)
-        self.means = self.room((count, 3), np.float64 if wide else np.float32)
+        wide = any(isinstance(level, Splats) and level.means.dtype == float for level in levels)
+        self.means = self.room((count, 3), float if wide else np.float32)
         for number, level in enumerate(levels):
             for block in [level.means] if isinstance(level, Splats) else level.positions():
                 if not np.isfinite(block).all():
@@ -150,14 +148,14 @@ class _Tree:
                 self.means[at : at + len(block)] = block
                 at += len(block)
 
-    def room(self, shape: int | tuple[int, int], dtype: type[Any] = np.int64) -> NDArray[Any]:
+    def room(self, shape: int | tuple[int, int], dtype: type[Any] = np.int64) -> Values:
         """Allocate an array in memory, or in a temporary file that is removed with it."""
         if self.scratch is None or np.prod(shape) < _ROWS_AT_ONCE:
             return np.empty(shape, dtype)
         with TemporaryFile(dir=self.scratch) as file:
             return np.memmap(file, dtype, "w+", shape=shape)
 
-    def of(self, rows: Rows, axes: tuple[int, ...]) -> Node:
+    def of(self, rows: Int, axes: tuple[int, ...]) -> Node:
         """Build the node of these rows; `axes` are the axes of its ancestors' cuts, outermost first."""
         low, high = self._box(rows)
         sides = high - low
@@ -170,15 +168,15 @@ class _Tree:
         other = self.of(above, (*axes, axis))
         return Node(np.minimum(one.low, other.low), np.maximum(one.high, other.high), (one, other))
 
-    def _box(self, rows: Rows) -> tuple[Float, Float]:
+    def _box(self, rows: Int) -> tuple[Float, Float]:
         boxes = []
         for at in _split_rows(len(rows)):
             part = self.means[rows[at]]
             boxes.append((part.min(axis=0), part.max(axis=0)))
-        low, high = np.array(boxes, np.float64).swapaxes(0, 1)
+        low, high = np.array(boxes, float).swapaxes(0, 1)
         return low.min(axis=0), high.max(axis=0)
 
-    def _halves(self, rows: Rows, axis: int, axes: tuple[int, ...]) -> tuple[Rows, Rows]:
+    def _halves(self, rows: Int, axis: int, axes: tuple[int, ...]) -> tuple[Int, Int]:
         """Split rows at the median of `axis`; ties go by earlier cuts' axes, last first, then by row."""
         middle = len(rows) // 2
         values = np.empty(len(rows), self.means.dtype)
@@ -207,7 +205,7 @@ class _Tree:
             done += len(some)
         return below, above
 
-    def _leaf(self, rows: Rows) -> Node:
+    def _leaf(self, rows: Int) -> Node:
         """Build the leaf of these rows: its rows per level, and the box of their Gaussians' 1σ extents."""
         ends = np.searchsorted(rows, self.starts)
         parts = []
@@ -220,7 +218,7 @@ class _Tree:
             self.filled += b - a
             if a < b:
                 some = level.take(part)
-                means = some.means.astype(np.float64)
+                means = some.means.astype(float)
                 reach = _measure_reach(some)
                 low = np.minimum(low, (means - reach).min(axis=0))
                 high = np.maximum(high, (means + reach).max(axis=0))
