@@ -103,7 +103,7 @@ def write_blocks(path: Path, count: int, blocks: Iterable[Points], *, overwrite:
 
     def rows_of(points: Points) -> Values:
         if not (np.isfinite(points.positions).all() and np.isfinite(points.colors).all()):
-            raise InputError("not written: a point is not finite", path=path)
+            raise InputError("not written: a point is not finite")
         colors = np.rint(np.clip(points.colors, 0, 1) * 255)
         return unstructured_to_structured(np.hstack([points.positions, colors]), np.dtype([*types.items()]))
 

@@ -68,7 +68,7 @@ def check_points(path: Path) -> None:
     if is_table(path):
         return
     with path.open("rb") as file:
-        head = decoded(path, file.read(_HEAD))
+        head = decoded(file.read(_HEAD))
     names, _ = _text(re.sub(r"[^\r\n]*$", "", head) or head)
     if not {"x", "y", "z"} <= set(names):
         raise InputError(f"has no columns x, y and z (found {' '.join(names)})")

@@ -137,7 +137,7 @@ def write(path: Path, splats: Splats, *, overwrite: bool = False) -> float:
     """
     from plyfile import PlyData, PlyElement
 
-    given = writable(path, splats)
+    given = writable(splats)
     given = given.take(packing_order(given.means, _CHUNK_ROWS))
     error = rounding(given, given.narrowed())
     splats = as_stored(given)

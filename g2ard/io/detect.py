@@ -14,7 +14,7 @@ from typing import Any, Literal
 from g2ard.config.choices import BLACK, Colour
 from g2ard.errors import InputError
 from g2ard.io.finding import usable
-from g2ard.io.paths import AnyPath, about, check_regular
+from g2ard.io.paths import AnyPath, about, check_regular, naming
 from g2ard.io.signs import MESH, Sign, foreign, sign_of
 
 Kind = Literal["splats", "points", "views"]
@@ -139,17 +139,18 @@ def may_hold_views(path: Path) -> bool:
 def file_format(path: AnyPath) -> str:
     """Return the format of a file or folder; raise an `InputError` if it is missing or unsupported."""
     path = run_scene(path)
-    if path.is_dir():
-        return _folder_format(path)
-    if not path.exists():
+    with naming(path):
+        if path.is_dir():
+            return _folder_format(path)
+        if path.exists():
+            check_regular(path)
+            state = path.stat()
+            return _of_file(path, state.st_mtime_ns, state.st_size)
         if path.is_symlink():
-            raise InputError("is a broken link", path=path)
+            raise InputError("is a broken link")
         if re.match(r"(https?|s3|gs):/", str(path)):
-            raise InputError("g2ard reads local files; download it first", path=path)
-        raise InputError(f"no such file or folder{_near(path)}", path=path)
-    check_regular(path)
-    state = path.stat()
-    return _of_file(path, state.st_mtime_ns, state.st_size)
+            raise InputError("g2ard reads local files; download it first")
+        raise InputError(f"no such file or folder{_near(path)}")
 
 
 def reader(path: Path, name: str, expected: Kind) -> Any:
@@ -195,8 +196,7 @@ def _of_file(path: Path, modified: int, size: int) -> str:
             reason = f", and no table of points: {error.message}"
     raise InputError(
         f"unknown format {path.suffix!r}{reason} (scenes: {suffixes('splats')}; point clouds: "
-        f"{suffixes('points')}, .csv; views: a COLMAP folder, a .json, or a run)",
-        path=path,
+        f"{suffixes('points')}, .csv; views: a COLMAP folder, a .json, or a run)"
     )
 
 
@@ -213,7 +213,7 @@ def _check_content(path: Path) -> None:
     counts = suffix == ".bin" and path.name.lower() in _BY_NAME  # COLMAP's begin with a count, of any bytes
     if not fits and not counts:
         hint = f"rename it to {path.stem}{sign.reads}"
-        raise InputError(f"is {sign.what} in spite of its name", path=path, hint=hint)
+        raise InputError(f"is {sign.what} in spite of its name", hint=hint)
 
 
 _PACKED = ("las", "usd")
@@ -338,12 +338,12 @@ def _folder_format(path: Path) -> str:
     if (path / "tileset.json").is_file():
         return file_format(path / "tileset.json")
     if any(path.glob("tile-*.f32")) or (path / PARTS).is_dir():
-        raise InputError("has unfinished tiles", path=path, hint="run the same `g2ard ingest` again")
+        raise InputError("has unfinished tiles", hint="run the same `g2ard ingest` again")
     if error := incomplete(path):
         raise error
     if _holds_clouds(path):
         return "clouds"
-    raise InputError(_unsupported(path), path=path)
+    raise InputError(_unsupported(path))
 
 
 def clouds_in(folder: Path) -> list[Path]:
@@ -471,7 +471,7 @@ def _ply_format(path: Path) -> str:
     header = read_header(path)
     group = groups_of(header)[-1]
     if group not in header.counts:
-        raise InputError("has no 'vertex' element", path=path)
+        raise InputError("has no 'vertex' element")
     properties = scene_names(header.properties(group))
     if "packed_position" in properties:
         return "compressed_ply"
@@ -486,7 +486,5 @@ def _json_format(path: Path) -> str:
     if name := json_format(content):
         return name
     if not isinstance(content, dict):
-        raise InputError(
-            "is a JSON list, but not cameras of INRIA's trainer or of nerfstudio's ns-export", path=path
-        )
-    raise InputError("is neither a transforms.json ('frames') nor g2ard's views ('views')", path=path)
+        raise InputError("is a JSON list, but not cameras of INRIA's trainer or of nerfstudio's ns-export")
+    raise InputError("is neither a transforms.json ('frames') nor g2ard's views ('views')")

@@ -79,19 +79,19 @@ def write(path: Path, splats: Splats, *, overwrite: bool = False, compress: str 
     Return the largest change of a position by rounding.
     """
     require("compress", repr(compress), compress in (None, "spz"), "spz")
-    error = rounding(splats, writable(path, splats).narrowed())
+    error = rounding(splats, writable(splats).narrowed())
     splats = as_stored(splats)
     if compress is None:
-        content = _plain(path, splats)
+        content = _plain(splats)
     else:
-        content, packed = spz_glb(path, splats)
+        content, packed = spz_glb(splats)
         error += packed
     with atomic_output(path, overwrite) as temporary, temporary.open("wb") as file:
         file.writelines(content)
     return error
 
 
-def _plain(path: Path, splats: Splats) -> list[bytes]:
+def _plain(splats: Splats) -> list[bytes]:
     """Return the parts of a .glb with float32 attributes."""
     attributes = _attributes(splats)
     views: list[Json] = []
@@ -120,20 +120,20 @@ def _plain(path: Path, splats: Splats) -> list[bytes]:
         node["translation"] = (splats.offset * _GLTF_TURN).tolist()
     node |= _extras(splats)
     document = _document(node, list(attributes), views, accessors, start)
-    return _glb(path, document, blobs)
+    return _glb(document, blobs)
 
 
-def spz_glb(path: Path, splats: Splats, centre: Float | None = None) -> tuple[list[bytes], float]:
+def spz_glb(splats: Splats, centre: Float | None = None) -> tuple[list[bytes], float]:
     """Return the parts of a .glb that holds an SPZ, and the largest change of a position by rounding.
 
     The node's translation is the scene's `offset`, and `centre`, which makes coordinates small.
     """
     movable = centre is not None
     centre = np.zeros(3) if centre is None else centre
-    bits = spz.fraction_bits(path, splats.means.astype(float) - centre, splats, movable=movable)
+    bits = spz.fraction_bits(splats.means.astype(float) - centre, splats, movable=movable)
     splats = splats.take(packing_order(splats.means))
     means = (splats.means.astype(float) - centre) * (-1, 1, -1)
-    blob = spz.encoded(path, _about_y(splats), means, bits, _SPZ_VERSION)
+    blob = spz.encoded(_about_y(splats), means, bits, _SPZ_VERSION)
     stored = np.rint(means * (1, -1, -1) * (1 << bits)) / (1 << bits)
     ends = {end: getattr(stored, end)(axis=0).tolist() for end in ("min", "max")}
     names = {"POSITION": "VEC3", "COLOR_0": "VEC4"}
@@ -154,7 +154,7 @@ def spz_glb(path: Path, splats: Splats, centre: Float | None = None) -> tuple[li
     splatting = document["meshes"][0]["primitives"][0]["extensions"][EXTENSION]
     splatting["extensions"] = {SPZ_EXTENSION: {"bufferView": 0}}
     document["extensionsUsed"] = document["extensionsRequired"] = [EXTENSION, SPZ_EXTENSION]
-    return _glb(path, document, [blob]), spz.rounding(means, bits)
+    return _glb(document, [blob]), spz.rounding(means, bits)
 
 
 def _extras(splats: Splats) -> Json:
@@ -171,13 +171,13 @@ def _about_y(splats: Splats) -> Splats:
     )
 
 
-def _glb(path: Path, document: Json, blobs: list[bytes]) -> list[bytes]:
+def _glb(document: Json, blobs: list[bytes]) -> list[bytes]:
     start = sum(map(len, blobs))
     text = json.dumps(document, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 4)
     total = 12 + 8 + len(text) + 8 + start
     if total >= 1 << 32:
-        raise InputError(f"not written: {total:,} bytes exceed the 4 GiB of a .glb", path=path)
+        raise InputError(f"not written: {total:,} bytes exceed the 4 GiB of a .glb")
     head = struct.pack("<III", _MAGIC, 2, total) + struct.pack("<II", len(text), _JSON)
     return [head, text, struct.pack("<II", start, _BIN), *blobs]
 
@@ -310,7 +310,7 @@ def read(path: Path) -> Noted:
 def _chunks(path: Path) -> tuple[Any, bytes]:
     data = path.read_bytes()
     if path.suffix.lower() == ".gltf":
-        return _with_buffer(path, parse_json(path, decoded(path, data)))
+        return _with_buffer(path, parse_json(decoded(data)))
     if len(data) < 20 or struct.unpack_from("<II", data) != (_MAGIC, 2):
         raise InputError(f"not a .glb of glTF 2.0 (begins with {data[:4]!r})")
     found: dict[int, bytes] = {}
@@ -323,7 +323,7 @@ def _chunks(path: Path) -> tuple[Any, bytes]:
         at += 8 + size
     if _JSON not in found:
         raise InputError("holds no JSON chunk")
-    return parse_json(path, decoded(path, found[_JSON])), found.get(_BIN, b"")
+    return parse_json(decoded(found[_JSON])), found.get(_BIN, b"")
 
 
 def _with_buffer(path: Path, document: Any) -> tuple[Any, bytes]:

@@ -13,7 +13,7 @@ import msgspec
 from msgspec import Meta
 
 from g2ard.errors import InputError
-from g2ard.io.paths import read_text
+from g2ard.io.paths import about, read_text
 
 _LARGEST_NUMBER = sys.float_info.max
 _LONGEST_SHOWN_VALUE = 40  # longest value in a message, characters
@@ -88,11 +88,12 @@ def read_own(path: Path, format: str, version: int) -> Json:
 
 def read_any_json(path: Path) -> Any:
     """Return the content of a JSON file."""
-    return parse_json(path, read_text(path))
+    with about(path):
+        return parse_json(read_text(path))
 
 
-def parse_json(path: Path, text: str) -> Any:
-    """Return the content of JSON text; `path` is for errors.
+def parse_json(text: str) -> Any:
+    """Return the content of JSON text.
 
     Text in another character set than UTF-8 becomes Latin 1, in which names of files can be found.
     """
@@ -101,11 +102,11 @@ def parse_json(path: Path, text: str) -> Any:
     try:
         return json.loads(text)
     except json.JSONDecodeError as error:
-        raise InputError(f"is not JSON ({error.msg})", path=path, index=error.lineno, item="line") from error
+        raise InputError(f"is not JSON ({error.msg})", index=error.lineno, item="line") from error
     except RecursionError as error:
-        raise InputError("is nested too deeply", path=path) from error
+        raise InputError("is nested too deeply") from error
     except ValueError as error:  # an integer of thousands of digits
-        raise InputError(f"not JSON ({error})", path=path) from error
+        raise InputError(f"not JSON ({error})") from error
 
 
 def checked(value: Any, kind: type[Value], place: Place, entries: str | None = None) -> Value:

@@ -1,7 +1,6 @@
 """Helpers for writers of packed formats: checks, row order, quaternions."""
 
 from itertools import pairwise
-from pathlib import Path
 
 import numpy as np
 
@@ -22,13 +21,13 @@ _OTHER_COMPONENTS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
 """Indices of the components of a quaternion other than one."""
 
 
-def writable(path: Path, splats: Splats) -> Splats:
+def writable(splats: Splats) -> Splats:
     """Return the scene, or raise an `InputError` if it is empty or not finite."""
     if not len(splats):
-        raise InputError("not written: the scene has no Gaussians", path=path)
+        raise InputError("not written: the scene has no Gaussians")
     bad = np.flatnonzero(~splats.finite_rows())
     if len(bad):
-        raise InputError(f"not written: Gaussian {bad[0]} is not finite", path=path)
+        raise InputError(f"not written: Gaussian {bad[0]} is not finite")
     return splats
 
 
@@ -53,12 +52,12 @@ def rounding(splats: Splats, stored: Splats | Float) -> float:
     return float(np.nanmax(np.abs(world - splats.means)))
 
 
-def as_packed(path: Path, splats: Splats) -> Splats:
+def as_packed(splats: Splats) -> Splats:
     """Return a scene `as_stored` for a format of a few bits per coordinate: about its middle if that is far.
 
     Viewers keep such positions in half floats, which end at 65,504.
     """
-    form = as_stored(writable(path, splats))
+    form = as_stored(writable(splats))
     middle = np.rint(np.median(form.means.astype(float), axis=0))
     if np.abs(middle).max() > FAR_FROM_ORIGIN:
         return form.recentred(form.offset + middle)

@@ -51,23 +51,35 @@ def check_unpacked(packed: int, unpacked: int, path: Path | None = None) -> None
 
 
 @contextmanager
-def about(path: Path) -> Iterator[None]:
-    """Let errors in the block that name no file name this one, also those of the system."""
+def naming(path: AnyPath) -> Iterator[None]:
+    """Let errors in the block that name neither a file nor a parameter name this file."""
     try:
         yield
     except G2ardError as error:
-        raise error.at(path=error.path or path) from error.__cause__
-    except OSError as error:
-        raise InputError(error.strerror or str(error), path=path) from error
+        if error.path is not None or error.parameter is not None:
+            raise
+        raise error.at(path=path) from error.__cause__
+
+
+@contextmanager
+def about(path: Path) -> Iterator[None]:
+    """Do as `naming`, also for errors of the system."""
+    with naming(path):
+        try:
+            yield
+        except G2ardError:
+            raise
+        except OSError as error:
+            raise InputError(error.strerror or str(error), path=path) from error
 
 
 def read_text(path: Path) -> str:
     with about(path):
-        return decoded(path, path.read_bytes())
+        return decoded(path.read_bytes())
 
 
-def decoded(path: Path, data: bytes) -> str:
-    """Decode text in UTF-8, or in UTF-16 with a byte order mark, which is removed; `path` is for errors.
+def decoded(data: bytes) -> str:
+    """Decode text in UTF-8, or in UTF-16 with a byte order mark, which is removed.
 
     Bytes of other character sets become surrogates, see `g2ard.io.finding.readable`.
     """
@@ -75,9 +87,9 @@ def decoded(path: Path, data: bytes) -> str:
     try:
         text = data.decode("utf-16" if wide else "utf-8-sig", "strict" if wide else "surrogateescape")
     except UnicodeDecodeError as error:
-        raise InputError("not a text file", path=path) from error
+        raise InputError("not a text file") from error
     if "\0" in text:
-        raise InputError("not a text file", path=path)
+        raise InputError("not a text file")
     return text
 
 

@@ -256,7 +256,7 @@ def write(
     names = [*_MEANS, *(_NORMALS if normals else []), *_DC]
     names += [f"f_rest_{k}" for k in range(3 * ((degree + 1) ** 2 - 1))]
     names += ["opacity", *_SCALES, *_QUATS]
-    blocks = _blocks(path, (part.with_sh_degree(degree) for part in parts), names, normals)
+    blocks = _blocks((part.with_sh_degree(degree) for part in parts), names, normals)
     comments = plyfiles.comments_of(frame)
     if layout == "inria":
         comments = comments[1:]  # those that carry values: importers by position may count lines
@@ -264,7 +264,7 @@ def write(
     return error
 
 
-def _blocks(path: Path, parts: Iterable[Splats], names: list[str], normals: bool) -> Iterator[Float32]:
+def _blocks(parts: Iterable[Splats], names: list[str], normals: bool) -> Iterator[Float32]:
     first = 0
     for block in (part.take(slice(at, at + BLOCK)) for part in parts for at in range(0, len(part), BLOCK)):
         n = len(block)
@@ -284,6 +284,6 @@ def _blocks(path: Path, parts: Iterable[Splats], names: list[str], normals: bool
         if not finite.all():
             row, column = np.argwhere(~finite)[0]
             text = f"not written: {names[column]!r} of Gaussian {first + row} is not finite"
-            raise InputError(text, path=path)
+            raise InputError(text)
         yield rows
         first += n

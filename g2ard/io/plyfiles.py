@@ -15,7 +15,7 @@ from g2ard.arrays import Float, Values
 from g2ard.config.choices import AXES, Axes, RenderModel
 from g2ard.errors import InputError, damaged
 from g2ard.io.atomic import atomic_output
-from g2ard.io.paths import about, plain_numbers
+from g2ard.io.paths import about, naming, plain_numbers
 from g2ard.io.signs import AGAIN
 from g2ard.scene.splats import Splats
 from g2ard.scene.transform import moved_axes
@@ -264,7 +264,7 @@ def _check_rest(path: Path, end: int) -> None:
         if not file.read(_HEADER_LIMIT).strip(b"\0\r\n\t "):
             return
     text = f"has {path.stat().st_size - end:,} bytes after its last row: a transfer as text changed line ends"
-    raise InputError(f"{text}, or its header states too few rows", path=path, hint=AGAIN)
+    raise InputError(f"{text}, or its header states too few rows", hint=AGAIN)
 
 
 def _read(
@@ -291,13 +291,13 @@ def write_rows(
     elements = [PlyElement.describe(every, "vertex")]
     header = PlyData(elements, byte_order="<", comments=comments).header
     written = 0
-    with atomic_output(path, overwrite) as temporary, temporary.open("wb") as file:
+    with naming(path), atomic_output(path, overwrite) as temporary, temporary.open("wb") as file:
         file.write(header.encode("ascii") + b"\n")
         for rows in blocks:
             file.write(rows.data)
             written += len(rows)
         if written != count:
-            raise InputError(f"not written: got {written:,} vertices, expected {count:,}", path=path)
+            raise InputError(f"not written: got {written:,} vertices, expected {count:,}")
 
 
 def row_blocks(path: Path, every: Values, rows: int, start: int = 0) -> Iterator[tuple[int, Values]]:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from g2ard.config.choices import FormatName
 from g2ard.errors import OutputError
-from g2ard.io.paths import AnyPath
+from g2ard.io.paths import AnyPath, naming
 
 if TYPE_CHECKING:
     from g2ard.io.types import Note
@@ -119,7 +119,7 @@ def _unstated(path: AnyPath, splats: Splats) -> str | None:
     """Return how to get back coordinates that a .splat cannot state."""
     from g2ard.io.splat import form_of
 
-    form = form_of(Path(path), splats)
+    form = form_of(splats)
     if form.axes == "RDF" and not form.offset.any():
         return None
     move = f" --translate={','.join(f'{v:.12g}' for v in form.offset)}" if form.offset.any() else ""
@@ -139,9 +139,10 @@ def check_positions(path: AnyPath, splats: Splats, count: int | None = None) -> 
     if hasattr(writer, "check_far") and len(splats):
         from g2ard.io.packing import as_packed
 
-        packed = as_packed(Path(path), splats)
         widened = (len(splats) / (count or len(splats))) ** 0.5
-        writer.check_far(Path(path), packed, packed.means.astype(float), widened)
+        with naming(path):
+            packed = as_packed(splats)
+            writer.check_far(packed, packed.means.astype(float), widened)
 
 
 @dataclass

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from g2ard.config.checks import check_type, checks_arguments
 from g2ard.errors import InputError, OutputError
 from g2ard.io.atomic import atomic_output, check_output
+from g2ard.io.paths import naming
 from g2ard.io.scene_formats import Rounding, check_options, lost_in, scene_format
 from g2ard.io.source import Source
 from g2ard.progress import Progress, Say, silent
@@ -49,7 +50,7 @@ def read_back(path: str | Path, splats: Splats) -> Splats:
     """Read what was written of a scene, where the scene is even if the format cannot say so."""
     read = read_splats(path)
     writer = scene_format(path).writer()
-    back: Splats = writer.read_back(Path(path), splats, read) if hasattr(writer, "read_back") else read
+    back: Splats = writer.read_back(splats, read) if hasattr(writer, "read_back") else read
     return back
 
 
@@ -115,7 +116,8 @@ def write_scene(
     check_scene_output(path, overwrite)
     writer = getattr(output_format.writer(), output_format.function)
     told = {"progress": progress} if output_format.tells else {}
-    error = writer(Path(path), splats, overwrite=overwrite, **told, **options)
+    with naming(path):
+        error = writer(Path(path), splats, overwrite=overwrite, **told, **options)
     rounding = Rounding(far=bool((splats.narrowed().offset != splats.offset).any()))
     rounding.add(error, splats)
     return [*rounding.notes, *lost_in(path, splats, **options)]

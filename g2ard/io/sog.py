@@ -25,7 +25,7 @@ from g2ard.config.choices import Axes, RenderModel
 from g2ard.errors import InputError, damaged
 from g2ard.io.jsonfile import FileName, Place, Vector, Whole, checked, parse_json, read_json
 from g2ard.io.packing import from_smallest_three
-from g2ard.io.paths import check_regular, check_unpacked, decoded, file_identity
+from g2ard.io.paths import check_regular, check_unpacked, decoded, file_identity, naming
 from g2ard.io.photo_headers import open_image
 from g2ard.io.sanitize import BLOCK, Raw, logits_of
 from g2ard.io.stream import RawStream, from_row, ranges
@@ -99,8 +99,9 @@ class _Chunk:
         self.place = place
         self.files = files
         self.file = Place(place / "meta.json")
-        text = decoded(self.file.path, self.read("meta.json"))
-        self.meta = checked(parse_json(self.file.path, text), _Meta, self.file)
+        with naming(self.file.path):
+            content = parse_json(decoded(self.read("meta.json")))
+        self.meta = checked(content, _Meta, self.file)
 
     def read(self, name: str) -> bytes:
         """Read a file, from an archive within `check_unpacked`."""

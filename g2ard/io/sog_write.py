@@ -49,15 +49,15 @@ def write(path: Path, splats: Splats, *, overwrite: bool = False, progress: Prog
     Return the largest change of a position by rounding.
     """
     with atomic_output(path, overwrite) as temporary:
-        temporary.write_bytes(sog_bytes(path, splats, progress))
+        temporary.write_bytes(sog_bytes(splats, progress))
     return largest_rounding(splats)
 
 
-def sog_bytes(path: Path, splats: Splats, progress: Progress = silent) -> bytes:
-    """Return the bytes of a .sog; `path` is for messages."""
+def sog_bytes(splats: Splats, progress: Progress = silent) -> bytes:
+    """Return the bytes of a .sog."""
     room = io.BytesIO()
     with zipfile.ZipFile(room, "w") as bundle:
-        for name, content in sog_files(path, splats, progress=progress).items():
+        for name, content in sog_files(splats, progress=progress).items():
             bundle.writestr(zipfile.ZipInfo(name, (1980, 1, 1, 0, 0, 0)), content)
     return room.getvalue()
 
@@ -67,7 +67,7 @@ def write_folder(
 ) -> float:
     """Write `path`, a meta.json, and its images beside it; return what `write` returns."""
     with atomic_folder(path.parent, overwrite) as temporary:
-        for name, content in sog_files(path, splats, progress=progress).items():
+        for name, content in sog_files(splats, progress=progress).items():
             (temporary / name).write_bytes(content)
     return largest_rounding(splats)
 
@@ -90,18 +90,16 @@ def palette_size(count: int) -> int:
     return min(1 << 16, 1 << (count.bit_length() - 1))
 
 
-def sog_files(
-    path: Path, splats: Splats, *, ordered: bool = False, progress: Progress = silent
-) -> dict[str, bytes]:
+def sog_files(splats: Splats, *, ordered: bool = False, progress: Progress = silent) -> dict[str, bytes]:
     """Return the files of a scene by name, meta.json last; rows in `packing_order` unless already `ordered`.
 
     An `offset`, and other axes than y down, are stored under "g2ard" in meta.json; other programs show the
     recentred scene, upright.
     """
-    splats = as_stored(writable(path, splats))
+    splats = as_stored(writable(splats))
     if not ordered:
         splats = splats.take(packing_order(splats.means))
-    width, height = _size(path, len(splats))
+    width, height = _size(len(splats))
     files = {}
     meta = {"version": 2, "asset": {"generator": f"g2ard {__version__}"}, "count": len(splats)}
     meta["antialias"] = splats.antialiased
@@ -141,12 +139,12 @@ def sog_files(
     return files
 
 
-def _size(path: Path, count: int) -> Size:
+def _size(count: int) -> Size:
     """Return width and height, multiples of 4, of an image of `count` pixels."""
     width = math.ceil(math.sqrt(count) / 4) * 4
     height = math.ceil(count / width / 4) * 4
     if max(width, height) > _LONGEST_WEBP_SIDE:
-        raise InputError(f"not written: {count:,} Gaussians exceed the largest SOG image", path=path)
+        raise InputError(f"not written: {count:,} Gaussians exceed the largest SOG image")
     return width, height
 
 

@@ -35,7 +35,7 @@ class Stream(RawStream):
         size = path.stat().st_size
         if not size or size % _ROW.itemsize:
             text = f"is not a complete .splat: {size:,} bytes are not a multiple of 32"
-            raise damaged(text, path=path)
+            raise damaged(text)
         rows = spread_rows(np.memmap(path, _ROW, "r"))
         with np.errstate(invalid="ignore"):
             right = np.isfinite(rows["mean"]).all(1) & ((rows["scale"] >= 0) & (rows["scale"] < _FAR)).all(1)
@@ -44,7 +44,7 @@ class Stream(RawStream):
         if words or right.mean() < _POSSIBLE:
             what = "text" if words else f"{1 - right.mean():.0%} of its rows are impossible"
             hint = "rename it to the suffix of its format, or export it again"
-            raise InputError(f"is not a .splat: {what}", path=path, hint=hint)
+            raise InputError(f"is not a .splat: {what}", hint=hint)
         super().__init__(path, size // _ROW.itemsize)
 
     def raw(self, rows: int, start: int) -> Iterator[Raw]:
@@ -57,9 +57,9 @@ class Stream(RawStream):
             yield raw
 
 
-def form_of(path: Path, splats: Splats) -> Splats:
+def form_of(splats: Splats) -> Splats:
     """Return a scene as a .splat holds it: y down, and relative to an offset if it is far from the origin."""
-    form = as_packed(path, splats)
+    form = as_packed(splats)
     world = form.positions
     step = np.spacing(np.abs(world).max().astype(np.float32))
     far = np.abs(np.median(world, axis=0)).max() > FAR_FROM_ORIGIN
@@ -68,9 +68,9 @@ def form_of(path: Path, splats: Splats) -> Splats:
     return replace(form, means=world.astype(np.float32), offset=np.zeros(3))
 
 
-def read_back(path: Path, splats: Splats, read: Splats) -> Splats:
+def read_back(splats: Splats, read: Splats) -> Splats:
     """Return what was `read` of a file of the scene where the scene is, which the file cannot state."""
-    form = form_of(path, splats)
+    form = form_of(splats)
     return restored(replace(read, offset=form.offset), form.axes)
 
 
@@ -79,7 +79,7 @@ def write(path: Path, splats: Splats, *, overwrite: bool = False) -> float:
 
     It cannot state an `offset` or axes: see `form_of`. Return the largest change of a position by rounding.
     """
-    form = form_of(path, splats)
+    form = form_of(splats)
     exact = splats.positions
     again = restored(form, form.axes)
     error = float(np.abs(again.positions - exact).max())

@@ -131,7 +131,7 @@ def _in_place(path: Path, scene: Splats, own: bytes) -> Splats:
     """Return a scene with the offset and axes that g2ard stated in a comment or record, if it is one."""
     if b'"g2ard"' not in own:
         return scene
-    place = checked(parse_json(path, own.decode("latin-1")), _Comment, JsonPlace(path)).g2ard
+    place = checked(parse_json(own.decode("latin-1")), _Comment, JsonPlace(path)).g2ard
     if place.stored != "RUB":
         scene = with_axes(scene, change_of_axes(place.stored, "RUB"))
     return restored(replace(scene, offset=moved_axes(place.offset, place.axes, "RDF")), place.axes)
@@ -291,13 +291,12 @@ def write(
     if axes not in ("RUB", "RDF") and spz_version != 4:
         raise InputError(
             f"version {spz_version} has RUB axes, or RDF for programs that expect those of a .ply",
-            path=path,
             hint="{spz_version=4} can name others",
         )
     error = packing.rounding(splats, splats.narrowed()) if len(splats) else 0.0
-    splats = packing.as_packed(path, splats)
+    splats = packing.as_packed(splats)
     own = packing.own_place(splats)
-    bits = fraction_bits(path, splats.means.astype(float), splats)
+    bits = fraction_bits(splats.means.astype(float), splats)
     splats = replace(splats, offset=np.zeros(3))
     if axes != "RUB":
         splats = with_axes(splats, change_of_axes("RUB", "RDF") @ change_of_axes("RDF", axes))
@@ -307,7 +306,7 @@ def write(
     if own and axes != named:
         own["stored"] = axes
     comment = json.dumps({"g2ard": own}, separators=(",", ":")).encode() if own else b""
-    content = encoded(path, splats, means, bits, spz_version, named, progress, comment)
+    content = encoded(splats, means, bits, spz_version, named, progress, comment)
     with atomic_output(path, overwrite) as temporary:
         temporary.write_bytes(content)
     return error + rounding(means, bits)
@@ -320,7 +319,6 @@ def rounding(means: Values, bits: int) -> float:
 
 
 def encoded(
-    path: Path,
     splats: Splats,
     means: Float,
     bits: int,
@@ -346,8 +344,7 @@ def encoded(
     head = _MAGIC + struct.pack("<IIBBB", spz_version, len(splats), splats.sh_degree, bits, flags)
     if spz_version < 4:
         return _gzipped(head + b"\0" + b"".join(streams), progress, comment)
-    with about(path):
-        zstd = _zstandard()
+    zstd = _zstandard()
     packed = []
     for number, stream in enumerate(streams):
         progress("pack", number, len(streams))
@@ -373,13 +370,13 @@ def _gzipped(content: bytes, progress: Progress, comment: bytes) -> bytes:
     return packed[:3] + bytes([_COMMENTED]) + packed[4:10] + comment + b"\0" + packed[10:]
 
 
-def check_far(path: Path, splats: Splats, means: Float, widened: float = 1.0, movable: bool = False) -> None:
+def check_far(splats: Splats, means: Float, widened: float = 1.0, movable: bool = False) -> None:
     """Raise the error of `fraction_bits` for a scene whose Gaussians will be `widened` times as large."""
     wide = replace(splats, scales=splats.scales * np.float32(widened))
-    fraction_bits(path, means, wide, movable=movable)
+    fraction_bits(means, wide, movable=movable)
 
 
-def fraction_bits(path: Path, means: Float, splats: Splats, *, movable: bool = False) -> int:
+def fraction_bits(means: Float, splats: Splats, *, movable: bool = False) -> int:
     """Return the fractional bits of 24-bit coordinates.
 
     Usually 12. More, as far as the extent allows, if a step of 2^−12 exceeds a quarter of the 1st percentile
@@ -406,7 +403,6 @@ def fraction_bits(path: Path, means: Float, splats: Splats, *, movable: bool = F
     if 2 * len(far) > len(means):
         raise InputError(
             f".spz is too coarse at {farthest:g} from the origin {steps}",
-            path=path,
             hint="write another format",
         )
     near = np.delete(splats.means, far, axis=0).astype(float) + splats.offset
@@ -414,7 +410,6 @@ def fraction_bits(path: Path, means: Float, splats: Splats, *, movable: bool = F
     raise InputError(
         f".spz is too coarse at {farthest:g} from the origin {steps}, where {plural(len(far), 'Gaussian')} "
         f"of {len(means):,} lie (row {some(far.tolist())})",
-        path=path,
         hint=f"crop the scene with `g2ard convert --box={','.join(f'{v:.0f}' for v in ends)}`, or write "
         "another format",
     )

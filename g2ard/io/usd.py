@@ -46,17 +46,17 @@ def write(path: Path, splats: Splats, *, overwrite: bool = False, progress: Prog
     which reading turns. Units are metres. Return the largest change of a position by
     rounding.
     """
-    error = rounding(splats, writable(path, splats).narrowed())
+    error = rounding(splats, writable(splats).narrowed())
     splats = as_stored(splats)
     binary = path.suffix.lower() != ".usda"
-    pxr = _pxr(path) if binary else None
+    pxr = _pxr() if binary else None
     with atomic_output(path, overwrite) as temporary:
         if pxr is not None:
             try:
                 _save(pxr, temporary, splats, progress)
             except (pxr.Tf.ErrorException, RuntimeError) as error:
                 reason = str(error).strip().splitlines()[-1].strip()
-                raise OutputError(f"cannot write: {reason}", path=path) from error
+                raise OutputError(f"cannot write: {reason}") from error
         else:
             with temporary.open("w", encoding="utf-8", newline="\n") as file:
                 _print(file, splats, progress)
@@ -143,7 +143,7 @@ def read(path: Path) -> Noted:
 
     Instances are read as often as they occur. Of time samples, the earliest count.
     """
-    pxr = _pxr(path)
+    pxr = _pxr()
     try:
         stage = pxr.Usd.Stage.Open(str(path))
     except pxr.Tf.ErrorException as error:
@@ -280,10 +280,10 @@ def _to_ply(pxr: Any, stage: Any, prim: Any) -> Float:
     return flip @ upright @ world @ flip
 
 
-def _pxr(path: Path) -> Any:
+def _pxr() -> Any:
     try:
         import pxr
         from pxr import Gf, Tf, Usd, UsdGeom, UsdVol, Vt  # noqa: F401
     except ImportError as error:
-        raise missing("reading OpenUSD, or writing .usdc,", "usd-core", path=path) from error
+        raise missing("reading OpenUSD, or writing .usdc,", "usd-core") from error
     return pxr

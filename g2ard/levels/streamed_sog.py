@@ -26,6 +26,7 @@ from g2ard.errors import InputError
 from g2ard.io.atomic import atomic_folder, drop_empty, drop_temporaries
 from g2ard.io.jsonfile import read_json
 from g2ard.io.packing import packing_order
+from g2ard.io.paths import naming
 from g2ard.io.scene_formats import Rounding
 from g2ard.io.scenes import tell
 from g2ard.io.sog_write import largest_rounding, sog_files
@@ -104,7 +105,8 @@ def save_levels(
             for name in files.parts:  # linked, not moved: an interrupted call resumes from them
                 shutil.copytree((work / name).parent, (folder / name).parent, copy_function=_link)
         if environment is not None:
-            _write_part(folder / _ENVIRONMENT_META, sog_files(path / _ENVIRONMENT_META, environment))
+            with naming(path / _ENVIRONMENT_META):
+                _write_part(folder / _ENVIRONMENT_META, sog_files(environment))
             files.rounding.add(largest_rounding(environment), environment)
         write_json(folder / "lod-meta.json", meta)
     if work is not None:
@@ -185,7 +187,8 @@ class _Files:
             rows = self._rows(name)
             self.rounding.add(self.error + largest_rounding(rows), rows)
             if not (folder / name).exists():
-                _write_part(folder / name, sog_files(path / name, rows, ordered=True))
+                with naming(path / name):
+                    _write_part(folder / name, sog_files(rows, ordered=True))
             progress("write", number, len(self.parts))
 
     def _rows(self, name: str) -> Splats:

@@ -22,6 +22,7 @@ from g2ard.config.schema import Settings
 from g2ard.errors import InputError, missing
 from g2ard.io.glb import EXTENSION, SPZ_EXTENSION, spz_glb
 from g2ard.io.packing import writable
+from g2ard.io.paths import naming
 from g2ard.io.scene_formats import Rounding
 from g2ard.io.spz import check_far
 from g2ard.io.types import Note
@@ -186,7 +187,8 @@ def check_tiles(path: Path, splats: Splats, ratio: float, cut: Cut | None = None
         return
     means = splats.means.astype(float)
     middle = np.rint((means.min(axis=0) + means.max(axis=0)) / 2)
-    check_far(path, splats, means - middle, ratio**0.5, movable=True)
+    with naming(path):
+        check_far(splats, means - middle, ratio**0.5, movable=True)
 
 
 def _turn_upright(direction: ArrayLike) -> Float:
@@ -236,7 +238,8 @@ class _Tiles:
         level, rows, middle = self.files[name]
         some = self.levels[level].take(np.concatenate(rows))
         splats = replace(some, offset=np.zeros(3), axes="RDF")
-        parts, error = spz_glb(self.path / name, writable(self.path / name, splats), np.rint(middle))
+        with naming(self.path / name):
+            parts, error = spz_glb(writable(splats), np.rint(middle))
         self.rounding.add(self.error + error, splats)
         return parts
 

@@ -16,6 +16,7 @@ from g2ard._core import __version__
 from g2ard.config.choices import BLACK
 from g2ard.errors import InputError, OutputError
 from g2ard.io.atomic import atomic_output, check_output
+from g2ard.io.paths import naming
 from g2ard.io.sog_write import sog_bytes
 from g2ard.progress import Progress, silent
 from g2ard.scene.splats import Splats
@@ -160,7 +161,8 @@ def _list_channels(background: Sequence[float] | None) -> list[float] | None:
 
 
 def _pack(path: Path, label: str, splats: Splats, progress: Progress) -> bytes:
-    packed = sog_bytes(path, replace(splats, offset=np.zeros(3)), progress)
+    with naming(path):
+        packed = sog_bytes(replace(splats, offset=np.zeros(3)), progress)
     if len(packed) > _LARGEST_SOG_BYTES:
         raise InputError(
             f"{label} has {len(packed) / 1e6:.0f} MB as SOG, but browsers accept at most"

@@ -158,7 +158,7 @@ def test_sog(tmp_path: Path, name: str, degree: int) -> None:
     assert (np.abs(found.means - truth.means) <= half * slope * 1.01 + 1e-6).all()
     assert turned(found.quats, truth.quats).max() <= 3 * math.sqrt(2) / 255 / 2 + 1e-6
     np.testing.assert_allclose(found.opacities, truth.opacities, atol=0.5 / 255 + 1e-6)
-    files = sog_files(tmp_path, truth)
+    files = sog_files(truth)
     meta = json.loads(files["meta.json"])
     for values, back, book in (
         (truth.log_scales, found.log_scales, meta["scales"]["codebook"]),
@@ -220,7 +220,7 @@ def test_spz_bits_follow_the_extent(tmp_path: Path) -> None:
     for extent in (0.01, 1.0, 3000.0, 100_000.0):
         truth = scene(400, 0)
         truth = replace(truth, means=truth.means / 10 * extent, scales=truth.scales * extent)
-        bits = fraction_bits(tmp_path, truth.means.astype(float), truth)
+        bits = fraction_bits(truth.means.astype(float), truth)
         assert np.abs(truth.means).max() * 2.0**bits < 1 << 23
         found = read_splats(saved(tmp_path / "..", f"{extent}.spz", truth, overwrite=True))
         np.testing.assert_allclose(
@@ -228,7 +228,7 @@ def test_spz_bits_follow_the_extent(tmp_path: Path) -> None:
             np.sort(truth.means, 0),
             atol=0.5 / 2**bits + 1e-6 * extent,
         )
-    assert fraction_bits(tmp_path, np.full((1, 3), 4.0), scene(400, 0)) >= 12
+    assert fraction_bits(np.full((1, 3), 4.0), scene(400, 0)) >= 12
     fine = Splats.create([[1e7, 0, 0], [0, 0, 0]], scales=np.full((2, 3), 0.01))
     with pytest.raises(InputError, match=r"at 5e\+06 from the origin \(steps of 1\)"):
         write_splats(tmp_path / "fine.spz", fine)
