@@ -127,7 +127,7 @@ def _wrong(name: str, parameter: str, annotation: str) -> Iterator[Any]:
         yield from [] if (name, parameter) in SIGNED else [-1]
     elif annotation.startswith(("Splats", "Cameras", "Targets", "Camera")):
         yield from ([BALL, BALL], [1, 2], 3.5)
-    elif annotation.startswith(("ArrayLike", "NDArray", "Sequence[float]", "Colour")):
+    elif annotation.startswith((*checks._ARRAY_NAMES, "Sequence[float]", "Colour")):
         yield from ("x", -1)
         yield from [(NAN, 0, 0), (1, 2)] if parameter in VECTORS else []
     elif not annotation.startswith("str"):

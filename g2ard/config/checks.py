@@ -240,7 +240,10 @@ class _Array:
         return cls
 
 
-_ARRAY_NAMES = {"ArrayLike": _Array, "NDArray": _Array}
+_ARRAY_NAMES = dict.fromkeys(
+    ("ArrayLike", "NDArray", "Bytes", "Float", "Float32", "Int", "Mask", "Rows", "Values"), _Array
+)
+"""Names of array types in annotations. `g2ard.arrays` itself loads numpy, too slow for `--help`."""
 
 
 @cache

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from g2ard.arrays import Float
 from g2ard.poses.votes import Votes
 from g2ard.progress import plural
 from g2ard.scene.cameras import Cameras
-from g2ard.scene.reproducible import Floats, canonical_order, norms
+from g2ard.scene.reproducible import canonical_order, norms
 from g2ard.scene.splats import Splats
 
 _SAMPLE = 8192
@@ -121,12 +122,12 @@ def _sample_visible(scene: Splats) -> Splats:
     return some.take(some.finite_rows())
 
 
-def _find_points(scene: Splats) -> Floats:
+def _find_points(scene: Splats) -> Float:
     points = scene.positions
     return points[np.isfinite(points).all(axis=1)]
 
 
-def _measure_sizes(scene: Splats) -> Floats:
+def _measure_sizes(scene: Splats) -> Float:
     scales = np.sort(np.abs(scene.scales.astype(np.float64)), axis=1)
     return np.sqrt(scales[:, 1] * scales[:, 2])
 
@@ -137,11 +138,11 @@ def _cast_votes(scene: Splats) -> Votes:
     return Votes.of(_find_points(some), _measure_sizes(some), some.opacities.astype(np.float64), represents)
 
 
-def _take_within(points: Floats, votes: Votes) -> Floats:
+def _take_within(points: Float, votes: Votes) -> Float:
     return points[norms(points - votes.centre) <= votes.radius]
 
 
-def _halve_region(before: Floats, after: Floats) -> list[tuple[Floats, Floats]]:
+def _halve_region(before: Float, after: Float) -> list[tuple[Float, Float]]:
     """Halve a region along its widest axis."""
     axis = int(np.argmax(np.ptp(before, axis=0)))
     cut = np.median(before[:, axis])

@@ -10,9 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 import g2ard._core as _core
+from g2ard.arrays import Float, Float32, Mask, Values
 from g2ard.errors import InputError
 from g2ard.poses.votes import Votes
-from g2ard.scene.reproducible import Floats, canonical_order, middle, norms, quantile, turned
+from g2ard.scene.reproducible import canonical_order, middle, norms, quantile, turned
 from g2ard.scene.splats import Splats
 from g2ard.scene.transform import rotation_matrices
 from g2ard.system.cached import cached_property
@@ -77,18 +78,18 @@ class Matter:
         horizon: distance from `centre` at which a sky begins; inf without one.
     """
 
-    points: Floats
-    weights: Floats
-    scales: Floats
-    quats: NDArray[np.float32]
-    order: NDArray[Any]
-    opacities: Floats
-    origin: Floats
+    points: Float
+    weights: Float
+    scales: Float
+    quats: Float32
+    order: Values
+    opacities: Float
+    origin: Float
     size: float
     represents: float = 1.0
-    beyond: Floats = field(default_factory=lambda: np.zeros((0, 3)))
+    beyond: Float = field(default_factory=lambda: np.zeros((0, 3)))
     beyond_share: float = 0.0
-    centre: Floats = field(default_factory=lambda: np.zeros(3))
+    centre: Float = field(default_factory=lambda: np.zeros(3))
     horizon: float = np.inf
 
     @classmethod
@@ -146,23 +147,23 @@ class Matter:
         return replace(self, **{name: getattr(self, name)[:count] for name in names})
 
     @cached_property
-    def normals(self) -> Floats:
+    def normals(self) -> Float:
         """(M, 3) unit axes of the smallest scales, sign arbitrary."""
         return self.axes(slice(None))[:, 0]
 
     @cached_property
-    def faces(self) -> Floats:
+    def faces(self) -> Float:
         """(M,) mass × flatness, where flatness is 1 − smallest / middle scale."""
         thick = np.maximum(self.scales[:, 1], np.finfo(float).tiny)
         return self.weights * (1 - self.scales[:, 0] / thick)
 
-    def axes(self, rows: Any) -> Floats:
+    def axes(self, rows: Any) -> Float:
         """Return (m, 3, 3) the unit axes of some rows, by ascending scale."""
         axes = rotation_matrices(self.quats[rows]).swapaxes(1, 2)
         return np.take_along_axis(axes, self.order[rows][:, :, None], axis=1)
 
 
-def _find_near(means: Floats, weights: Floats, votes: Votes) -> NDArray[np.bool_]:
+def _find_near(means: Float, weights: Float, votes: Votes) -> Mask:
     """Return the rows that people look at from near: without a sky, surroundings and floaters.
 
     What lies beyond a gap is judged by votes. Of the rest, rows within `_FAR` typical distances of the centre
@@ -198,14 +199,14 @@ class Grid:
             cell; 0 in empty cells.
     """
 
-    low: Floats
+    low: Float
     cell: float
     opaque: NDArray[np.int8]
     murky: NDArray[np.int8]
-    scale: NDArray[np.float32]
+    scale: Float32
 
     @classmethod
-    def of(cls, low: Floats, high: Floats, matter: Matter, axes: Floats) -> Grid:
+    def of(cls, low: Float, high: Float, matter: Matter, axes: Float) -> Grid:
         """Fill the box from `low` to `high`, along the rows of `axes`."""
         count = len(matter.points)
         cells = _CELLS_A_ROW * count if matter.represents > 1 else int(np.clip(count, *_CELLS))
@@ -240,7 +241,7 @@ class Grid:
         opaque, murky = (_count_steps((filled > limit).reshape(shape)) for limit in (_OPAQUE, _MURKY))
         return cls(low, cell, opaque, murky, scale.reshape(shape))
 
-    def distance(self, points: Floats) -> Floats:
+    def distance(self, points: Float) -> Float:
         """Return (M,) distances to the nearest murky cell, or to the box if that is farther.
 
         Distances within the box are at most `_REACH` − 1 cells.
@@ -251,12 +252,12 @@ class Grid:
         outside = norms(np.maximum(0, np.maximum(self.low - points, points - high)))
         return np.where(inside, found, np.maximum(outside, found))
 
-    def scale_at(self, points: Floats) -> Floats:
+    def scale_at(self, points: Float) -> Float:
         """Return (M,) values of `scale` in the cells of points, 0 outside the box."""
         index, inside = _index_cells(points, self.low, self.cell, np.array(self.murky.shape))
         return np.where(inside, self.scale.ravel()[index], 0.0)
 
-    def cast(self, eyes: Floats, directions: Floats, *, murky: bool = False) -> Floats:
+    def cast(self, eyes: Float, directions: Float, *, murky: bool = False) -> Float:
         """Return (M,) distances at which unit rays meet an opaque or a murky cell; inf without one."""
         steps = self.murky if murky else self.opaque
         return _core.cast_rays(
@@ -269,9 +270,7 @@ class Grid:
         )
 
 
-def _index_cells(
-    points: Floats, low: Floats, cell: float, shape: NDArray[Any]
-) -> tuple[Any, NDArray[np.bool_]]:
+def _index_cells(points: Float, low: Float, cell: float, shape: Values) -> tuple[Any, Mask]:
     """Return flat cell indices, clamped into the box, and whether each point was in it."""
     flat = np.zeros(len(points), np.int64)
     inside = np.ones(len(points), bool)
@@ -282,7 +281,7 @@ def _index_cells(
     return flat, inside
 
 
-def _count_steps(filled: NDArray[np.bool_]) -> NDArray[np.int8]:
+def _count_steps(filled: Mask) -> NDArray[np.int8]:
     """Return king's moves to the nearest filled cell, at most `_REACH`."""
     steps = np.full(filled.shape, _REACH, np.int8)
     steps -= filled

@@ -6,9 +6,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from g2ard.arrays import Float
 from g2ard.poses.sight import Lens, Poses, Rays, Survey, gather
 from g2ard.poses.site import Site
-from g2ard.scene.reproducible import Floats, between, directions, halton, norms, quantile, turned
+from g2ard.scene.reproducible import between, directions, halton, norms, quantile, turned
 from g2ard.scene.samples import evenly_spaced
 
 _ELEVATIONS = (-5.0, 50.0)
@@ -85,7 +86,7 @@ def plan_orbit(survey: Survey, count: int, shift: int = 0, first: int | None = N
     lens = survey.lens
     target = site.box.mean(axis=0)
 
-    def tried(start: int, stop: int) -> tuple[Poses, Floats]:
+    def tried(start: int, stop: int) -> tuple[Poses, Float]:
         turn, rise, chance = halton(start, stop, 3, survey.seed + shift).T
         z = between(np.sin(np.radians(_ELEVATIONS)), rise)
         outward = directions(turn, np.sqrt(1 - z * z), z)
@@ -99,7 +100,7 @@ def plan_orbit(survey: Survey, count: int, shift: int = 0, first: int | None = N
     return gather(survey, count if first is None else min(first, count), tried)
 
 
-def _fit_distances(site: Site, target: Floats, outward: Floats, lens: Lens) -> Floats:
+def _fit_distances(site: Site, target: Float, outward: Float, lens: Lens) -> Float:
     """Return (P,) distances at which `_FITTING` of the matter is in frame, and all of it ahead."""
     points = site.points[:_OUTLINE] - target
     weights = site.weights[:_OUTLINE]
@@ -137,13 +138,13 @@ def ring(survey: Survey, rises: Sequence[float], turns: int) -> Poses:
     return Poses(eyes, gazes).take(site.is_free(eyes, 2, _LOWEST))
 
 
-def _measure_away(x: Floats, y: Floats, wide: float, tall: float, body: float) -> Floats:
+def _measure_away(x: Float, y: Float, wide: float, tall: float, body: float) -> Float:
     """Return the distances from which points (x, y) off the line of sight, and `body` around them, are in
     frame."""
     return np.maximum((np.abs(x) + body) / wide, (np.abs(y) + body) / tall) + body
 
 
-def circle(survey: Survey, gazes: Floats) -> Poses:
+def circle(survey: Survey, gazes: Float) -> Poses:
     """Return poses on a level circle around a scene, with all of it just in frame."""
     target = survey.site.box.mean(axis=0)
     body = survey.site.body
@@ -177,7 +178,7 @@ def plan_aerial(survey: Survey, count: int, shift: int = 0, first: int | None = 
     lens = survey.lens
     height = _choose_height(site, count, lens)
 
-    def tried(start: int, stop: int) -> tuple[Poses, Floats]:
+    def tried(start: int, stop: int) -> tuple[Poses, Float]:
         x, y, kind, turn, pitch, chance = halton(start, stop, 6, survey.seed + shift).T
         inset = _INSET * (site.box[1] - site.box[0])
         spots = site.box[0] + inset + (site.box[1] - site.box[0] - 2 * inset) * np.stack([x, y, x], axis=1)

@@ -7,8 +7,9 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from g2ard.arrays import Float, Mask
 from g2ard.config.choices import POOL_KINDS
 from g2ard.errors import InputError, require
 from g2ard.io.splits import HOLD_OUT
@@ -98,7 +99,7 @@ class Pool:
     cameras: Cameras
     kind: str
     why: str
-    up: NDArray[np.float64]
+    up: Float
     unseen: float = 0.0
     coarse: float = 0.0
     more: Callable[[str, int], list[Camera]] = field(default=lambda kind, count: [])
@@ -331,7 +332,7 @@ def _plan_auto(survey: Survey, count: int) -> tuple[dict[str, Poses], str]:
     return parts, "; ".join(why)
 
 
-def _see_sharply(survey: Survey, poses: Poses) -> NDArray[np.bool_]:
+def _see_sharply(survey: Survey, poses: Poses) -> Mask:
     """Return whether each pose sees the scene sharply; matter behind the scene does not count."""
     site = survey.site
     away = norms(poses.eyes - site.box.mean(axis=0))

@@ -5,15 +5,16 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from g2ard.arrays import Float, Float32
 from g2ard.errors import InputError
 from g2ard.poses.outside import circle, ring
 from g2ard.poses.sight import Lens, Poses, Survey
 from g2ard.poses.site import Site
 from g2ard.poses.within import WIDE, closed, is_room, plan_inside, plan_sharp, plan_walk
 from g2ard.scene.cameras import Cameras
-from g2ard.scene.reproducible import Floats, around, between, canonical_order, halton, turned
+from g2ard.scene.reproducible import around, between, canonical_order, halton, turned
 from g2ard.scene.samples import take_evenly
 from g2ard.scene.splats import Splats
 
@@ -107,10 +108,10 @@ class Outlook:
     """
 
     cameras: Cameras
-    seen: NDArray[np.float32]
-    clear: Floats
-    detail: Floats
-    spread: Floats
+    seen: Float32
+    clear: Float
+    detail: Float
+    spread: Float
 
     @classmethod
     def of(cls, survey: Survey, cameras: Cameras, full: float = -1.0) -> Outlook:
@@ -228,7 +229,7 @@ def turntable(
     *,
     size: tuple[int, int] = (800, 600),
     axis: ArrayLike | None = None,
-) -> tuple[Cameras, Floats]:
+) -> tuple[Cameras, Float]:
     """Return views at equal angles that begin with the best one, and the up direction.
 
     Scenes that are shown from around turn as a whole. Within a scene, the camera turns in place. Photos turn
@@ -260,7 +261,7 @@ def turntable(
     return replace(views, names=tuple(f"{i:04d}" for i in range(count))), site.axes[2]
 
 
-def _turn_within_arc(angles: Floats, seen: Floats) -> Floats:
+def _turn_within_arc(angles: Float, seen: Float) -> Float:
     """Turn full circles into swings that begin at 0 and keep to the `seen` angles, if these leave a gap.
 
     >>> _turn_within_arc(np.radians([0, 90, 180, 270]), np.radians([0, 60, -30])).round(3).tolist()
@@ -299,7 +300,7 @@ def _find_best(survey: Survey, count: int, cameras: Cameras | None) -> tuple[Cam
     return replace(found, names=tuple(f"view_{i:04d}" for i in range(len(found)))), kind
 
 
-def _measure_wholeness(survey: Survey, look: Outlook) -> Floats:
+def _measure_wholeness(survey: Survey, look: Outlook) -> Float:
     """Return (V,) how much photos show of their subject, which most have in the middle, and how whole."""
     outward = np.stack([camera.outward(survey.outlook.points) for camera in look.cameras])
     middle = (look.seen * np.exp(-np.square(outward / _MIDDLE) / 2)).mean(axis=0)
@@ -310,7 +311,7 @@ def _measure_wholeness(survey: Survey, look: Outlook) -> Floats:
     return shown / max(float(shown.max()), 1e-30) * within**_UNCUT
 
 
-def _choose(look: Outlook, worth: Floats, count: int) -> list[int]:
+def _choose(look: Outlook, worth: Float, count: int) -> list[int]:
     """Return clear views in order of what they add, times their worth."""
     clear = look.clear + _LEAST
     worth = np.where(clear >= _CLEAR * clear.max(initial=0), worth * clear, 0.0)

@@ -7,16 +7,16 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 import g2ard._core as _core
+from g2ard.arrays import Float, Float32, Int, Mask
 from g2ard.config.choices import BLACK
 from g2ard.errors import require
 from g2ard.poses.site import Inside, Site
 from g2ard.poses.votes import Votes
 from g2ard.rendering.renderer import RasterSettings, View, view_of
 from g2ard.scene.cameras import Cameras
-from g2ard.scene.reproducible import Floats, canonical_order, norms, quantile, turned
+from g2ard.scene.reproducible import canonical_order, norms, quantile, turned
 from g2ard.scene.splats import Splats
 from g2ard.system.cached import cached_property
 
@@ -84,7 +84,7 @@ class Lens:
         return half, half * self.size[1] / self.size[0]
 
     @property
-    def matrix(self) -> Floats:
+    def matrix(self) -> Float:
         """(3, 3) pinhole intrinsics in pixels."""
         width, height = self.size
         focal = width / 2 / self.tangents[0]
@@ -95,13 +95,13 @@ class Lens:
 class Poses:
     """Eyes (P, 3) and unit gazes (P, 3), upright in a site's coordinates."""
 
-    eyes: Floats
-    gazes: Floats
+    eyes: Float
+    gazes: Float
 
     def __len__(self) -> int:
         return len(self.eyes)
 
-    def take(self, index: NDArray[np.int64] | NDArray[np.bool_] | slice) -> Poses:
+    def take(self, index: Int | Mask | slice) -> Poses:
         """Return the poses that `index` selects, in its order."""
         return Poses(self.eyes[index], self.gazes[index])
 
@@ -113,7 +113,7 @@ class Poses:
         gazes = [p.gazes for p in parts]
         return cls(np.concatenate([none, *eyes]), np.concatenate([none, *gazes]))
 
-    def frames(self) -> Floats:
+    def frames(self) -> Float:
         """Return (P, 3, 3) rotations whose rows are right, down and ahead, in the site's coordinates."""
         level = np.cross(self.gazes, [0.0, 0.0, 1.0])
         steep = np.linalg.norm(level, axis=1) < 1e-6  # straight down: the top of the image is the site's y
@@ -148,7 +148,7 @@ class Glance:
         self._colors = np.clip(sample.colors.astype(np.float64), 0, 1)
         self.points = means + self._middle
         self.opacities = sample.opacities
-        self._arrays: tuple[NDArray[np.float32], ...] = (
+        self._arrays: tuple[Float32, ...] = (
             np.ascontiguousarray(means, np.float32),
             np.ascontiguousarray(sample.quats, np.float32),
             np.ascontiguousarray(np.where(shortest, logs, logs + np.log(widen)), np.float32),
@@ -157,7 +157,7 @@ class Glance:
             np.zeros((len(means), 0, 3), np.float32),
         )
 
-    def of(self, cameras: Cameras, reach: Floats | None = None) -> Floats:
+    def of(self, cameras: Cameras, reach: Float | None = None) -> Float:
         """Look through C cameras, and measure how much matter each sees, and how sharply.
 
         Returns:
@@ -180,7 +180,7 @@ class Glance:
         away = norms(cameras.positions - self._middle)
         return 1e-3 * float(np.median(away)) or None if len(cameras) else None
 
-    def sights(self, cameras: Cameras) -> tuple[Floats, Floats, Floats, Floats, NDArray[np.float32]]:
+    def sights(self, cameras: Cameras) -> tuple[Float, Float, Float, Float, Float32]:
         """Look through C cameras, and tell what each sees of every Gaussian.
 
         Returns:
@@ -203,7 +203,7 @@ class Glance:
             spread[i] = np.sqrt(sum(_measure_variance(channel, shown) for channel in self._colors.T))
         return covered, fine, detail, spread, seen
 
-    def clear(self, cameras: Cameras, aims: NDArray[np.int64], close: float) -> Floats:
+    def clear(self, cameras: Cameras, aims: Int, close: float) -> Float:
         """Return the (C,) mean transmittances in front of what C views have in the middle, over its pixels.
 
         Args:
@@ -217,14 +217,14 @@ class Glance:
         ]
         return np.array(found, np.float64)
 
-    def murk(self, cameras: Cameras, close: float) -> Floats:
+    def murk(self, cameras: Cameras, close: float) -> Float:
         """Return the (C,) shares of the images that show matter nearer than `close`, scene units."""
         renders = self._renders(cameras, _NEAR * close)
         return np.array([sums["weight"][depth < close].sum() / np.prod(v[2]) for sums, depth, v in renders])
 
     def _renders(
         self, cameras: Cameras, near: float | None, crop: bool = False
-    ) -> Iterator[tuple[dict[str, Any], Floats, View]]:
+    ) -> Iterator[tuple[dict[str, Any], Float, View]]:
         """Yield each camera's sums, the distances to the Gaussians, and the view as kernels take it."""
         if not len(cameras):
             return
@@ -240,7 +240,7 @@ class Glance:
                 yield sums, norms(self._means - here.positions[i]), views[i - first]
 
 
-def _measure_variance(values: Floats, weights: Floats) -> float:
+def _measure_variance(values: Float, weights: Float) -> float:
     total = max(float(weights.sum()), 1e-30)
     mean = float((weights * values).sum()) / total
     return float((weights * (values - mean) ** 2).sum()) / total
@@ -322,21 +322,21 @@ class Rays:
         self._directions = np.einsum("ri,pij->prj", rays, poses.frames()).reshape(-1, 3)
 
     @cached_property
-    def _stopped(self) -> Floats:
+    def _stopped(self) -> Float:
         return self._site.grid.cast(self._eyes, self._directions)
 
     @cached_property
-    def _met(self) -> Floats:
+    def _met(self) -> Float:
         met = self._site.grid.cast(self._eyes, self._directions, murky=True)
         return np.sort(met.reshape(self._shape), axis=1)
 
     @property
-    def covered(self) -> Floats:
+    def covered(self) -> Float:
         """Share of the rays that opaque matter stops."""
         return np.isfinite(self._stopped).reshape(self._shape).mean(axis=1)
 
     @property
-    def standing(self) -> Floats:
+    def standing(self) -> Float:
         """Share of the rays stopped by matter that stands on the ground; all of it without a ground."""
         hit = np.isfinite(self._stopped)
         points = self._eyes[hit] + self._stopped[hit, None] * self._directions[hit]
@@ -344,12 +344,12 @@ class Rays:
         return hit.reshape(self._shape).mean(axis=1)
 
     @property
-    def close(self) -> Floats:
+    def close(self) -> Float:
         """Distance at which a tenth of the rays have met something, even if only leaves or haze."""
         return self._met[:, self._shape[1] // 10]
 
     @property
-    def median(self) -> Floats:
+    def median(self) -> Float:
         """Median distance of the rays that meet anything; inf if none does."""
         halfway = np.isfinite(self._met).sum(axis=1) // 2
         return self._met[np.arange(len(halfway)), halfway]
@@ -358,7 +358,7 @@ class Rays:
 def gather(
     survey: Survey,
     count: int,
-    tried: Callable[[int, int], tuple[Poses, Floats]],
+    tried: Callable[[int, int], tuple[Poses, Float]],
     *,
     patience: int = _PATIENCE,
 ) -> Poses:

@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from g2ard.arrays import Float, Mask
 from g2ard.poses.matter import Grid, Matter
 from g2ard.poses.up import Up, estimate_up, facing, given_up
 from g2ard.scene.reproducible import (
-    Floats,
     along,
     between,
     fibonacci,
@@ -86,7 +86,7 @@ class Inside:
         weight: share of a pool that stands within: up to 1, or ½ without a ground (a shell may be an object).
     """
 
-    places: Floats
+    places: Float
     share: float
     weight: float
 
@@ -113,19 +113,19 @@ class Site:
         horizon: distance from `centre` at which a sky begins; inf without one.
     """
 
-    points: Floats
-    weights: Floats
-    box: Floats
+    points: Float
+    weights: Float
+    box: Float
     body: float
     terrain: Terrain | None
     grid: Grid
-    axes: Floats
-    origin: Floats
+    axes: Float
+    origin: Float
     size: float
     vertical: Up
-    beyond: Floats
+    beyond: Float
     beyond_share: float
-    centre: Floats
+    centre: Float
     horizon: float
 
     @classmethod
@@ -169,19 +169,19 @@ class Site:
             horizon=matter.horizon,
         )
 
-    def ground(self, points: Floats) -> Floats:
+    def ground(self, points: Float) -> Float:
         """Return (M,) heights of the ground under points, or of the box's bottom without a ground."""
         if self.terrain is None:
             return np.full(len(points), self.box[0, 2])
         return self.terrain.height(points)
 
-    def above_ground(self, points: Floats) -> Floats:
+    def above_ground(self, points: Float) -> Float:
         """Return (M,) heights above the ground, infinite without a ground."""
         if self.terrain:
             return points[:, 2] - self.ground(points)
         return np.full(len(points), np.inf)
 
-    def is_free(self, points: Floats, cells: float, above: float = -np.inf) -> NDArray[np.bool_]:
+    def is_free(self, points: Float, cells: float, above: float = -np.inf) -> Mask:
         """Return whether points are over `cells` cells from matter, `above` the ground and below a sky."""
         free = (self.grid.distance(points) > cells * self.grid.cell) & (self.above_ground(points) > above)
         return free & (norms(points - self.centre) < _BELOW_SKY * self.horizon)
@@ -197,7 +197,7 @@ class Site:
         wide, deep, tall = self.box[1] - self.box[0]
         return self.terrain is not None and bool(tall < _FLAT * np.sqrt(wide * deep))
 
-    def met(self, points: Floats, ways: Floats) -> Floats:
+    def met(self, points: Float, ways: Float) -> Float:
         """Return (M, D) distances from each point to matter in each of D directions; inf without any."""
         eyes = np.repeat(points, len(ways), axis=0)
         return self.grid.cast(eyes, np.tile(ways, (len(points), 1))).reshape(len(points), len(ways))
@@ -220,7 +220,7 @@ class Site:
         return Inside(places, share, weight)
 
 
-def _choose_axes(some: Matter, axis: Floats) -> Floats:
+def _choose_axes(some: Matter, axis: Float) -> Float:
     """Return rows: along the scene if it is long, otherwise along a coordinate axis; to its left; up."""
     ahead = np.eye(3)[int(np.argmin(np.round(np.abs(axis), 3)))]
     ahead = ahead - (ahead @ axis) * axis
@@ -240,12 +240,12 @@ def _choose_axes(some: Matter, axis: Floats) -> Floats:
 class Terrain:
     """Heights of the ground at the centres of square blocks, from the corner `low`."""
 
-    low: Floats
+    low: Float
     block: float
-    heights: Floats
+    heights: Float
 
     @classmethod
-    def of(cls, points: Floats, weights: Floats, box: Floats) -> Terrain:
+    def of(cls, points: Float, weights: Float, box: Float) -> Terrain:
         """Estimate the ground as a low quantile of the heights per block, with roofs and canopies cut off.
 
         Points, (M, 3) with mass (M,), are the matter that faces up or down; the box is the scene's.
@@ -269,7 +269,7 @@ class Terrain:
         padded = np.pad(opened, 1, mode="edge")
         return cls(box[0, :2], block, _stack_neighbours(padded, 0.0).mean(axis=0)[1:-1, 1:-1])
 
-    def height(self, points: Floats) -> Floats:
+    def height(self, points: Float) -> Float:
         """Return (M,) ground heights under points: bilinear within the map, constant beyond its edge."""
         top = np.array(self.heights.shape) - 1
         place = np.clip((points[:, :2] - self.low) / self.block - 0.5, 0, top)
@@ -282,7 +282,7 @@ class Terrain:
         return total
 
 
-def _fill(heights: Floats, default: float) -> Floats:
+def _fill(heights: Float, default: float) -> Float:
     """Fill gaps with the mean of their neighbours, ring by ring."""
     if np.isnan(heights).all():
         return np.full_like(heights, default)
@@ -293,7 +293,7 @@ def _fill(heights: Floats, default: float) -> Floats:
     return heights
 
 
-def _stack_neighbours(heights: Floats, outside: float) -> Floats:
+def _stack_neighbours(heights: Float, outside: float) -> Float:
     """Return (9, X, Y), the neighbourhood of each cell, padded with `outside`."""
     wide = np.pad(heights, 1, constant_values=outside)
     windows = np.lib.stride_tricks.sliding_window_view(wide, heights.shape)

@@ -5,10 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from g2ard.arrays import Float, Mask
 from g2ard.poses.matter import Matter
-from g2ard.scene.reproducible import Floats, along, fibonacci, moments, quantile
+from g2ard.scene.reproducible import along, fibonacci, moments, quantile
 from g2ard.scene.transform import unit_up
 
 _FACING = np.cos(np.radians(20))
@@ -48,7 +49,7 @@ _SEARCHED = 20_000
 class Up:
     """Unit vector away from the ground, whether there is a ground, and the reason."""
 
-    axis: Floats
+    axis: Float
     grounded: bool
     why: str
 
@@ -96,12 +97,12 @@ def estimate_up(sample: Matter) -> Up:
     return _choose_sign(sample, np.array([0.0, -1.0, 0.0]), False, "no ground; a guess")
 
 
-def facing(sample: Matter, axis: Floats, least: float = _SLOPED) -> NDArray[np.bool_]:
+def facing(sample: Matter, axis: Float, least: float = _SLOPED) -> Mask:
     """Return (K,) whether normals face along an axis, by default as on sloped ground."""
     return np.abs(along(sample.normals, axis)) > least
 
 
-def _is_flat(sample: Matter) -> tuple[bool, Floats, Floats | None]:
+def _is_flat(sample: Matter) -> tuple[bool, Float, Float | None]:
     """Return whether the scene is flat, its thinnest axis, and its longest axis if the scene is long."""
     w = sample.weights / sample.weights.sum()
     centred = sample.points - (w[:, None] * sample.points).sum(axis=0)
@@ -110,7 +111,7 @@ def _is_flat(sample: Matter) -> tuple[bool, Floats, Floats | None]:
     return bool(values[0] < _SHEET * values[1]), vectors[:, 0], long
 
 
-def _find_layer(sample: Matter, axis: Floats) -> tuple[float, float, float]:
+def _find_layer(sample: Matter, axis: Float) -> tuple[float, float, float]:
     """Return the strongest layer that faces `axis`: its share of all matter, its height, and its edge.
 
     The edge is the share, reduced by matter on both sides: ground and walls have it on one side.
@@ -133,20 +134,20 @@ def _find_layer(sample: Matter, axis: Floats) -> tuple[float, float, float]:
     return float(share), float(height), float(edge)
 
 
-def _favour_habit(axis: Floats) -> float:
+def _favour_habit(axis: Float) -> float:
     """Return a factor that favours y and z, the up axes of nearly every file, over other directions."""
     return 1.2 if np.abs(axis[1:]).max() > np.cos(np.radians(15)) else 1.0
 
 
-def _mean_normal(sample: Matter, axis: Floats, rows: NDArray[np.bool_]) -> Floats:
+def _mean_normal(sample: Matter, axis: Float, rows: Mask) -> Float:
     weights = sample.faces[rows]
     if not weights.sum() > 0:
         return axis
-    mean: Floats = np.linalg.eigh(moments(sample.normals[rows], weights))[1][:, 2]
+    mean: Float = np.linalg.eigh(moments(sample.normals[rows], weights))[1][:, 2]
     return mean * np.copysign(1.0, mean @ axis)
 
 
-def _choose_sign(sample: Matter, axis: Floats, grounded: bool, why: str) -> Up:
+def _choose_sign(sample: Matter, axis: Float, grounded: bool, why: str) -> Up:
     """Turn the axis to where the matter is on its ground, or away from an object's heavier end."""
     heights = along(sample.points, axis)
     ends = quantile(heights, sample.weights, [0.01, 0.99])
@@ -161,13 +162,13 @@ def _choose_sign(sample: Matter, axis: Floats, grounded: bool, why: str) -> Up:
     return Up(axis * sign, grounded, f"{why}, its sign by custom")
 
 
-def _measure_lowness(heights: Floats, weights: Floats, low: float, high: float) -> float:
+def _measure_lowness(heights: Float, weights: Float, low: float, high: float) -> float:
     """Return how low the mean height lies from `high`, −1, to `low`, 1."""
     mean = (weights * heights).sum() / weights.sum()
     return float(1 - 2 * (mean - low) / max(high - low, np.finfo(float).tiny))
 
 
-def _measure_lean(sample: Matter, axis: Floats, heights: Floats) -> float:
+def _measure_lean(sample: Matter, axis: Float, heights: Float) -> float:
     """Return how far the matter stands on the side of `axis`, from −1 to 1, relative to what faces it.
 
     Between a floor and a ceiling, the matter in between decides: furniture stands on floors. Otherwise

@@ -11,9 +11,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from g2ard.scene.reproducible import Floats, along, directions, fibonacci, halton, middle, norms, quantile
+from g2ard.arrays import Float, Mask
+from g2ard.scene.reproducible import along, directions, fibonacci, halton, middle, norms, quantile
 from g2ard.system.cached import cached_property
 
 _FOCAL = 858.0
@@ -80,13 +80,13 @@ class Votes:
         faces: (N,) opaque areas of the Gaussians that each stands for.
     """
 
-    points: Floats
-    reach: Floats
-    weights: Floats
-    faces: Floats
+    points: Float
+    reach: Float
+    weights: Float
+    faces: Float
 
     @classmethod
-    def of(cls, points: Floats, sizes: Floats, opacities: Floats, represents: float = 1.0) -> Votes:
+    def of(cls, points: Float, sizes: Float, opacities: Float, represents: float = 1.0) -> Votes:
         """Let the first `_VOTERS` rows vote, of which each row stands for some Gaussians."""
         some = slice(_VOTERS)
         represents *= len(points) / len(points[some])
@@ -97,15 +97,15 @@ class Votes:
             faces=represents * 2 * np.pi * np.square(sizes[some]) * opacities[some],
         )
 
-    def at(self, places: Floats) -> Floats:
+    def at(self, places: Float) -> Float:
         """Return (P,) shares of the scene that cover a pixel seen from each place, if nothing hides them."""
         return np.array([self.weights[self._sees(place)].sum() for place in places])
 
-    def _sees(self, place: Floats) -> NDArray[np.bool_]:
+    def _sees(self, place: Float) -> Mask:
         return norms(self.points - place) <= self.reach
 
     @cached_property
-    def centre(self) -> Floats:
+    def centre(self) -> Float:
         """(3,) the middle of the places with the most votes and the least mean logarithm of the distances.
 
         Where all is coarse, votes alone leave it open, and the middle of a dome has as many as its floor.
@@ -121,12 +121,12 @@ class Votes:
         order = np.argsort(away, kind="stable")
         return middle(best[order[: max(1, round(_CENTRAL * len(best)))]])
 
-    def _log_distance(self, place: Floats) -> float:
+    def _log_distance(self, place: Float) -> float:
         distances = np.maximum(norms(self.points - place), np.finfo(float).tiny)
         return float((self.weights * np.log(distances)).sum())
 
     @cached_property
-    def distances(self) -> Floats:
+    def distances(self) -> Float:
         """(N,) distances from `centre`."""
         return norms(self.points - self.centre)
 
@@ -185,7 +185,7 @@ class Votes:
         empty[beyond == len(far)] = False  # nothing lies beyond the gap
         return far[empty & ~np.append(empty[1:], False)].tolist()
 
-    def _around(self, radius: float) -> Floats:
+    def _around(self, radius: float) -> Float:
         """Return places around what is within a radius, from which it fits the frame."""
         within = self.distances <= radius
         away = _AWAY * float(quantile(self.distances[within], self.weights[within], _FITTING))

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from g2ard.arrays import Float, Int, Mask
 from g2ard.poses.sight import SIGHT_ROWS, Glance, Poses, Rays, Survey, gather
 from g2ard.poses.site import Site
-from g2ard.scene.reproducible import Floats, between, directions, fibonacci, halton, joined, norms, turned
+from g2ard.scene.reproducible import between, directions, fibonacci, halton, joined, norms, turned
 
-Reach = tuple[NDArray[np.int64], Floats, NDArray[np.bool_]]
+Reach = tuple[Int, Float, Mask]
 
 _ROOM_PITCHES = (-0.3, 0.2)
 """Range of gaze pitches above the horizon in rooms, in radians."""
@@ -117,7 +117,7 @@ def is_room(survey: Survey) -> bool:
     return survey.inside.weight > _MOSTLY_INSIDE
 
 
-def _direct_gazes(turn: Floats, rise: Floats) -> Floats:
+def _direct_gazes(turn: Float, rise: Float) -> Float:
     return directions(turn, np.cos(rise), np.sin(rise))
 
 
@@ -131,7 +131,7 @@ def plan_inside(survey: Survey, count: int) -> Poses:
     places = survey.inside.places
     wide = max(1, int(_WIDE * len(places)))
 
-    def tried(start: int, stop: int) -> tuple[Poses, Floats]:
+    def tried(start: int, stop: int) -> tuple[Poses, Float]:
         at, turn, pitch = halton(start, stop, 3, survey.seed + 1).T
         reach = np.where(np.arange(start, stop) % 2 == 0, wide, len(places))
         poses = Poses(places[(at * reach).astype(int)], _direct_gazes(turn, between(_ROOM_PITCHES, pitch)))
@@ -166,7 +166,7 @@ def plan_walk(survey: Survey, count: int, shift: int = 0, *, indoors: bool | Non
         places = places[closed(site, places, 16, -1.0, -0.8) > _FLOOR]
     places = places[_find_connected(site, places)]
 
-    def tried(start: int, stop: int) -> tuple[Poses, Floats]:
+    def tried(start: int, stop: int) -> tuple[Poses, Float]:
         turn, pitch = halton(start, stop, 2, survey.seed + shift + 1).T
         gazes = _direct_gazes(turn, np.radians(between(_WALK_PITCHES, pitch)))
         poses = Poses(places[np.arange(start, stop) % len(places)], gazes)
@@ -177,12 +177,12 @@ def plan_walk(survey: Survey, count: int, shift: int = 0, *, indoors: bool | Non
     return gather(survey, count if len(places) else 0, tried)
 
 
-def closed(site: Site, points: Floats, rays: int, low: float, high: float) -> Floats:
+def closed(site: Site, points: Float, rays: int, low: float, high: float) -> Float:
     """Return (M,) shares of the directions between two heights on the sphere that meet matter."""
     return np.isfinite(site.met(points, fibonacci(rays, low, high))).mean(axis=1)
 
 
-def _find_connected(site: Site, points: Floats) -> NDArray[np.bool_]:
+def _find_connected(site: Site, points: Float) -> Mask:
     """Return whether each point belongs to a large part of the graph that joins neighbours in sight."""
     count = len(points)
     apart = sum((column[:, None] - column) ** 2 for column in points.T)
@@ -203,7 +203,7 @@ def plan_sharp(survey: Survey, count: int, also: Poses | None = None) -> Poses:
     """
     site = survey.site
 
-    def tried(start: int, stop: int) -> tuple[Poses, Floats]:
+    def tried(start: int, stop: int) -> tuple[Poses, Float]:
         *at, turn, pitch = halton(2 * start, 2 * stop, 5, survey.seed + 2).T
         points = between(site.box, np.stack(at, axis=1))
         free = site.is_free(points, 3)
@@ -229,7 +229,7 @@ def plan_anywhere(survey: Survey, count: int) -> Poses:
     within = ((points > site.box[0]) & (points < site.box[1])).all(axis=1)
     rows = np.flatnonzero(within & (glance.opacities > _SOLID))
 
-    def tried(start: int, stop: int) -> tuple[Poses, Floats]:
+    def tried(start: int, stop: int) -> tuple[Poses, Float]:
         which, far, turn, rise = halton(start, stop, 4, survey.seed + 5).T
         aims = rows[(which * len(rows)).astype(int)]
         gazes = -_direct_gazes(turn, np.radians(between(_RISES, rise)))
@@ -297,7 +297,7 @@ def plan_near(survey: Survey, poses: Poses, reach: Reach, count: int, shift: int
     return near.take(clear).take(slice(count))
 
 
-def framed(survey: Survey, poses: Poses, points: Floats) -> NDArray[np.bool_]:
+def framed(survey: Survey, poses: Poses, points: Float) -> Mask:
     """Return (F,) whether any pose has each point in its frame."""
     wide, tall = survey.lens.tangents
     found = np.zeros(len(points), bool)
@@ -307,7 +307,7 @@ def framed(survey: Survey, poses: Poses, points: Floats) -> NDArray[np.bool_]:
     return found
 
 
-def plan_beyond(survey: Survey, poses: Poses, points: Floats, count: int) -> Poses:
+def plan_beyond(survey: Survey, poses: Poses, points: Float, count: int) -> Poses:
     """Plan at most `count` poses at the given places that look at points beyond the near matter.
 
     Each looks at a point that none before has in its frame, from where near matter hides little of the view.

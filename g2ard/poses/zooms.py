@@ -6,8 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from g2ard.arrays import Float
 from g2ard.scene.cameras import ZOOM, Camera, Cameras
-from g2ard.scene.reproducible import Floats, along, halton
+from g2ard.scene.reproducible import along, halton
 from g2ard.scene.samples import spread, take_evenly
 from g2ard.scene.splats import Splats
 
@@ -60,7 +61,7 @@ def zoomed(scene: Splats, cameras: Cameras, *, represents: float = 1.0, share: f
     return Cameras.of(views)
 
 
-def _place_window(view: Camera, point: Floats, at: Floats) -> Camera:
+def _place_window(view: Camera, point: Float, at: Float) -> Camera:
     """Return the window of a view that has a point at this share of its width and height, within the view."""
     size = np.array([view.width, view.height], np.float64)
     x, y, z = view.K @ (view.viewmat[:3, :3] @ point + view.viewmat[:3, 3])

@@ -9,8 +9,8 @@ from statistics import fmean
 from types import MappingProxyType
 
 import numpy as np
-from numpy.typing import NDArray
 
+from g2ard.arrays import Bytes, Float32
 from g2ard.config.choices import BLACK, Colour
 from g2ard.io.images import to_bytes, write_png
 from g2ard.progress import plural
@@ -38,8 +38,8 @@ class Pictures:
     """A view's target and what scenes show there, with their PSNR; pixels that are not scored are grey."""
 
     name: str
-    target: NDArray[np.uint8]
-    images: list[NDArray[np.uint8]]
+    target: Bytes
+    images: list[Bytes]
     psnrs: list[float]
 
 
@@ -63,11 +63,9 @@ class Drawn:
         for part in parts:
             self._scored |= {_identify(view): view.kind for view in part.cameras}
         self._worst: dict[str, list[tuple[float, _Key]]] = {kind: [] for kind in self._scored.values()}
-        self._kept: dict[_Key, dict[str, tuple[NDArray[np.uint8], float]]] = {}
+        self._kept: dict[_Key, dict[str, tuple[Bytes, float]]] = {}
 
-    def keep(
-        self, scene: str, targets: Targets, view: int, score: ViewScore, image: NDArray[np.float32]
-    ) -> None:
+    def keep(self, scene: str, targets: Targets, view: int, score: ViewScore, image: Float32) -> None:
         """Keep a scene's picture and PSNR if the report may show the view; the result is scored first."""
         key = _identify(targets.cameras[view])
         wanted = key in self._shown or key in self._kept
@@ -83,7 +81,7 @@ class Drawn:
         if wanted:
             self._kept.setdefault(key, {})[scene] = to_bytes(grey_unscored(image, targets, view)), score.psnr
 
-    def of(self, targets: Targets, view: int) -> Mapping[str, tuple[NDArray[np.uint8], float]]:
+    def of(self, targets: Targets, view: int) -> Mapping[str, tuple[Bytes, float]]:
         """Return the picture and PSNR of each scene that is kept of a view."""
         return self._kept.get(_identify(targets.cameras[view]), {})
 
@@ -115,7 +113,7 @@ def draw_pictures(
     target = targets[view]
     known = {} if drawn is None else drawn.of(targets, view)
 
-    def shown_of(name: str) -> tuple[NDArray[np.uint8], float]:
+    def shown_of(name: str) -> tuple[Bytes, float]:
         if name in known:
             return known[name]
         image = rendered(renderers[name], targets, view)
@@ -313,7 +311,7 @@ def write_preview(path: Path, drawn: Sequence[Pictures], scenes: Sequence[tuple[
     write_png(path, draw_contact_sheet(rows, labels, row_labels=captions), overwrite=True)
 
 
-def grey_unscored(image: NDArray[np.float32], targets: Targets, view: int) -> NDArray[np.float32]:
+def grey_unscored(image: Float32, targets: Targets, view: int) -> Float32:
     """Return an image of a view with the pixels that are not scored in grey."""
     mask = mask_of(targets, view)
     return image if mask is None else np.where(mask[..., None], image, _UNSCORED)

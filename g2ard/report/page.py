@@ -10,8 +10,8 @@ from pathlib import Path
 from urllib.parse import quote
 
 import numpy as np
-from numpy.typing import NDArray
 
+from g2ard.arrays import Bytes
 from g2ard.io.atomic import atomic_output
 from g2ard.io.images import to_bytes
 from g2ard.report.labels import TARGET
@@ -30,7 +30,7 @@ class Shown:
     """One rendering of a view: its method, image and caption."""
 
     name: str
-    image: NDArray[np.uint8]
+    image: Bytes
     caption: str = ""
 
 
@@ -53,7 +53,7 @@ def _slice_span(start: float, extent: float, size: int) -> slice:
     return slice(first, max(first + 1, min(size, round((start + extent) * size))))
 
 
-def find_worst_windows(image: NDArray[np.uint8], target: NDArray[np.uint8]) -> list[Window]:
+def find_worst_windows(image: Bytes, target: Bytes) -> list[Window]:
     """Return the windows with the largest error, worst first, in shares of the image's size."""
     error = ((image.astype(np.float64) - target) ** 2).sum(-1)
     height, width = error.shape
@@ -127,7 +127,7 @@ class Page:
             f"<tbody>{''.join(body)}</tbody></table></div>"
         )
 
-    def figure(self, image: NDArray[np.uint8], caption: str) -> None:
+    def figure(self, image: Bytes, caption: str) -> None:
         number = self._image(image)
         text = escape(caption)
         self._parts.append(
@@ -135,9 +135,7 @@ class Page:
             f"<figcaption>{text}</figcaption></figure>"
         )
 
-    def comparison(
-        self, title: str, target: NDArray[np.uint8], shown: Sequence[Shown], name: str = TARGET
-    ) -> None:
+    def comparison(self, title: str, target: Bytes, shown: Sequence[Shown], name: str = TARGET) -> None:
         """Add a view: a slider between the target, with a `name`, and any rendering, and magnified crops.
 
         The first rendering is shown initially, and its worst regions are magnified. Crops keep the resolution
@@ -182,7 +180,7 @@ class Page:
             f"<figcaption>{escape(shown.name)}</figcaption></figure>"
         )
 
-    def _image(self, image: NDArray[np.uint8]) -> int:
+    def _image(self, image: Bytes) -> int:
         from PIL import Image
 
         picture = Image.fromarray(to_bytes(image))

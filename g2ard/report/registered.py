@@ -7,8 +7,8 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from g2ard.arrays import Bytes, Float
 from g2ard.config.choices import Colour
 from g2ard.errors import InputError
 from g2ard.io.images import to_bytes
@@ -33,7 +33,7 @@ def write_registration_report(
     scene: Splats,
     cameras: Cameras,
     found: Registered,
-    starts: Mapping[str, NDArray[np.float64]],
+    starts: Mapping[str, Float],
     side: int,
     told: str,
     background: Colour,
@@ -80,9 +80,7 @@ def write_registration_report(
     page.write(path, overwrite)
 
 
-def _draw_matches(
-    photo: NDArray[np.uint8], render: NDArray[np.uint8], matches: NDArray[np.float64]
-) -> NDArray[np.uint8]:
+def _draw_matches(photo: Bytes, render: Bytes, matches: Float) -> Bytes:
     """Draw photo and render side by side, with a line for each match, (M, 4) pixels u, v of both."""
     from PIL import Image, ImageDraw
 

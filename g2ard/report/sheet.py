@@ -4,9 +4,10 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from PIL import Image, ImageDraw, ImageFont
 
+from g2ard.arrays import Bytes
 from g2ard.errors import InputError
 from g2ard.io.images import to_bytes
 
@@ -15,7 +16,7 @@ _SHEET_GAP = 6  # pixels between the images of a contact sheet
 
 def draw_contact_sheet(
     rows: Sequence[Sequence[ArrayLike]], labels: Sequence[str], *, row_labels: Sequence[str] = ()
-) -> NDArray[np.uint8]:
+) -> Bytes:
     """Arrange images of any sizes in a grid on a dark background: a row per view, a column per kind.
 
     Rows may be short, and have captions below.

@@ -2,22 +2,21 @@
 
 from collections.abc import Callable
 from itertools import chain
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from g2ard.arrays import Float, Values
 from g2ard.scene.shape import elongation
 from g2ard.scene.splats import Splats
 
-_TABLE: dict[tuple[str, ...], Callable[[Splats], NDArray[Any]]] = {
+_TABLE: dict[tuple[str, ...], Callable[[Splats], Values]] = {
     ("x", "y", "z"): lambda splats: splats.positions,
     ("opacity",): lambda splats: splats.opacities[:, None],
     ("scale_x", "scale_y", "scale_z"): lambda splats: splats.scales,
     ("rot_w", "rot_x", "rot_y", "rot_z"): lambda splats: splats.quats,
     ("red", "green", "blue"): lambda splats: splats.colors,
 }
-_DERIVED: dict[tuple[str, ...], Callable[[Splats], NDArray[Any]]] = {
+_DERIVED: dict[tuple[str, ...], Callable[[Splats], Values]] = {
     ("smallest_scale",): lambda splats: splats.scales.min(axis=1, keepdims=True),
     ("largest_scale",): lambda splats: splats.scales.max(axis=1, keepdims=True),
     ("elongation",): lambda splats: elongation(splats.scales)[:, None],
@@ -27,7 +26,7 @@ ATTRIBUTES = tuple(chain(*_TABLE, *_DERIVED))
 """Names of attributes that conditions can use."""
 
 
-def columns(splats: Splats) -> dict[str, NDArray[Any]]:
+def columns(splats: Splats) -> dict[str, Values]:
     """Return the columns of a table of attributes, each (N,), in order.
 
     World coordinates x, y, z; opacity in [0, 1]; scale_x, scale_y and scale_z, the standard deviations along
@@ -37,7 +36,7 @@ def columns(splats: Splats) -> dict[str, NDArray[Any]]:
     >>> list(columns(Splats.create([[1, 2, 3]], scales=[[1, 1, 1]])))[:5]
     ['x', 'y', 'z', 'opacity', 'scale_x']
     """
-    found: dict[str, NDArray[Any]] = {}
+    found: dict[str, Values] = {}
     for names, read in _TABLE.items():
         found |= zip(names, read(splats).T, strict=True)
     for k in range(splats.shN.shape[1]):
@@ -46,7 +45,7 @@ def columns(splats: Splats) -> dict[str, NDArray[Any]]:
     return found
 
 
-def attribute(splats: Splats, name: str) -> NDArray[np.float64]:
+def attribute(splats: Splats, name: str) -> Float:
     """Return the (N,) column of an attribute."""
     names, of = next(item for item in (*_TABLE.items(), *_DERIVED.items()) if name in item[0])
     return of(splats)[:, names.index(name)].astype(np.float64)

@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from g2ard.arrays import Float, Int, Mask
 from g2ard.config.checks import check_direction, check_fields, check_vector
 from g2ard.errors import InputError, require
 from g2ard.progress import plural
@@ -68,14 +69,14 @@ class Camera(Shown):
     ([0.0, -2.0, 0.0], [True, False])
     """
 
-    viewmat: NDArray[np.float64]
-    K: NDArray[np.float64]
+    viewmat: Float
+    K: Float
     width: int
     height: int
     name: str = "view"
     image_path: Path | None = None
     mask_path: Path | None = None
-    distortion: NDArray[np.float64] = field(default_factory=lambda: np.zeros(5))
+    distortion: Float = field(default_factory=lambda: np.zeros(5))
     kind: str = USUAL
     lens: PhotoLens | None = None
 
@@ -123,15 +124,15 @@ class Camera(Shown):
         return cls(look_at(position, target, up), K, width, height, name)
 
     @property
-    def position(self) -> NDArray[np.float64]:
+    def position(self) -> Float:
         """Centre of the camera in world coordinates, (3,)."""
         return -self.viewmat[:3, :3].T @ self.viewmat[:3, 3]
 
-    def holds(self, points: ArrayLike) -> NDArray[np.bool_]:
+    def holds(self, points: ArrayLike) -> Mask:
         """Return which of the (N, 3) world points lie within the image, as (N,) bool, ignoring occlusion."""
         return self.outward(points) <= 1
 
-    def outward(self, points: ArrayLike) -> NDArray[np.float64]:
+    def outward(self, points: ArrayLike) -> Float:
         """Return how far from the middle of the image (N, 3) world points lie: 1 at its edge, inf behind."""
         x, y, z = self.viewmat[:3, :3] @ (np.asarray(points, np.float64) - self.position).T
         K = self.K
@@ -168,13 +169,13 @@ class Cameras(Shown):
             than 160 million pixels.
     """
 
-    viewmats: NDArray[np.float64]
-    Ks: NDArray[np.float64]
-    widths: NDArray[np.int64]
-    heights: NDArray[np.int64]
+    viewmats: Float
+    Ks: Float
+    widths: Int
+    heights: Int
     names: tuple[str, ...]
     image_paths: tuple[Path | None, ...] = field(default=(), metadata=UNKEYED)  # targets key the photos
-    distortions: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 5)))
+    distortions: Float = field(default_factory=lambda: np.zeros((0, 5)))
     mask_paths: tuple[Path | None, ...] = field(default=(), metadata=UNKEYED)
     source: Path | None = field(default=None, metadata=UNKEYED)
     kinds: tuple[str, ...] = ()
@@ -206,7 +207,7 @@ class Cameras(Shown):
             message = fault.format(scale=scales[i], **size)
             raise InputError(f"({self.names[i]}) {message}", index=i, item="view")
 
-    def _faults(self, scales: NDArray[np.float64]) -> dict[str, NDArray[np.bool_]]:
+    def _faults(self, scales: Float) -> dict[str, Mask]:
         """Return the (C,) mask of each fault, the most basic first; keys are templates of messages."""
         n = len(self)
         rotations = self.viewmats[:, :3, :3]
@@ -230,12 +231,12 @@ class Cameras(Shown):
         }
 
     @property
-    def pixels(self) -> NDArray[np.int64]:
+    def pixels(self) -> Int:
         """(C,) number of pixels."""
         return self.widths * self.heights
 
     @property
-    def sides(self) -> NDArray[np.int64]:
+    def sides(self) -> Int:
         """(C,) longer side in pixels."""
         return np.maximum(self.widths, self.heights)
 
@@ -286,14 +287,14 @@ class Cameras(Shown):
         )
 
     @property
-    def positions(self) -> NDArray[np.float64]:
+    def positions(self) -> Float:
         """Camera centres in world coordinates, (C, 3)."""
         R = self.viewmats[:, :3, :3]
         t = self.viewmats[:, :3, 3]
         return -np.einsum("cji,cj->ci", R, t)
 
     @property
-    def forwards(self) -> NDArray[np.float64]:
+    def forwards(self) -> Float:
         """Unit viewing directions in world coordinates, (C, 3)."""
         return self.viewmats[:, 2, :3]
 
@@ -354,7 +355,7 @@ class Cameras(Shown):
         n = len(self)
         return replace(self, Ks=Ks, widths=np.full(n, width), heights=np.full(n, height))
 
-    def _by(self, factor: NDArray[np.float64]) -> Cameras:
+    def _by(self, factor: Float) -> Cameras:
         """Return the views with a factor on the size of each."""
         widths = np.maximum(1, np.rint(self.widths * factor)).astype(np.int64)
         heights = np.maximum(1, np.rint(self.heights * factor)).astype(np.int64)
@@ -393,7 +394,7 @@ class Cameras(Shown):
         Ks[:, :2, 2] -= corner
         return replace(self, Ks=Ks, widths=widths, heights=heights)
 
-    def facing(self, points: ArrayLike) -> NDArray[np.bool_]:
+    def facing(self, points: ArrayLike) -> Mask:
         """Return which views contain any of the points within their image.
 
         Args:
@@ -466,7 +467,7 @@ def rows_by_kind(kinds: Sequence[str]) -> dict[str, list[int]]:
     return {kind: members for kind, members in rows.items() if members}
 
 
-def look_at(position: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0)) -> NDArray[np.float64]:
+def look_at(position: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0)) -> Float:
     """Return camera_from_world of a camera at `position` facing `target`, image top towards `up`.
 
     Args:

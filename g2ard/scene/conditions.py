@@ -6,8 +6,8 @@ from functools import partial, reduce
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from g2ard.arrays import Mask, Values
 from g2ard.errors import InputError
 from g2ard.scene.attributes import ATTRIBUTES, attribute
 from g2ard.scene.splats import Splats
@@ -15,7 +15,7 @@ from g2ard.scene.splats import Splats
 _LONGEST = 1000  # characters of a condition at most, so that it cannot nest too deeply
 
 
-def fulfilling(splats: Splats, condition: str) -> NDArray[np.bool_]:
+def fulfilling(splats: Splats, condition: str) -> Mask:
     """Return the (N,) mask of Gaussians that fulfil a condition: `opacity > 0.05 and largest_scale < 2`.
 
     Names are `ATTRIBUTES`: those of `columns`; `smallest_scale` and `largest_scale` of the three standard
@@ -33,9 +33,7 @@ def fulfilling(splats: Splats, condition: str) -> NDArray[np.bool_]:
     return holds(condition, ATTRIBUTES, partial(attribute, splats), len(splats))
 
 
-def holds(
-    condition: str, names: Sequence[str], column: Callable[[str], NDArray[Any]], count: int
-) -> NDArray[np.bool_]:
+def holds(condition: str, names: Sequence[str], column: Callable[[str], Values], count: int) -> Mask:
     """Return the (count,) mask of rows that fulfil a condition, see `fulfilling`.
 
     Args:
@@ -71,7 +69,7 @@ def check_condition(condition: str) -> None:
     fulfilling(Splats.create(np.zeros((1, 3)), scales=np.ones((1, 3))), condition)
 
 
-_Columns = Mapping[str, Callable[[str], NDArray[Any]]]
+_Columns = Mapping[str, Callable[[str], Values]]
 """Name → function that returns the column of this name."""
 _ARITHMETIC: dict[type[ast.AST], Callable[[Any, Any], Any]] = {
     **{ast.Add: np.add, ast.Sub: np.subtract, ast.Mult: np.multiply, ast.Div: np.divide}

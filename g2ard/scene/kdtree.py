@@ -9,12 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from g2ard.arrays import Float, Float32, Rows
+
 _SAMPLE_SIGMAS = 4.0  # standard deviations by which a tile may exceed the count estimated from a sample
 _HALO_SHARE = 0.03  # margin of a halo as a fraction of a tile's side
 _BOX_PERCENTILES = 1, 99  # percentiles that bound a box when its sides are measured, to ignore floaters
-
-Points = NDArray[np.float32]
-Rows = NDArray[np.intp]
 
 
 @dataclass(frozen=True)
@@ -31,7 +30,7 @@ class KdTree:
         """Number of leaves."""
         return self.below.leaves + self.above.leaves if self.below and self.above else 1
 
-    def boxes(self) -> NDArray[np.float64]:
+    def boxes(self) -> Float:
         """Return the (leaves, 2, 3) low and high corners, infinite where nothing was cut."""
         boxes = [np.array([[-np.inf] * 3, [np.inf] * 3])]
         if self.below and self.above:
@@ -42,7 +41,7 @@ class KdTree:
             boxes = [*below, *above]
         return np.stack(boxes)
 
-    def route(self, points: Points, margin: float = 0.0) -> Iterator[tuple[Rows, Rows]]:
+    def route(self, points: Float32, margin: float = 0.0) -> Iterator[tuple[Rows, Rows]]:
         """Yield per leaf, in order, the rows in its box and the rows of other boxes within `margin`.
 
         A point is within the margin if it lies in the box after all sides move outwards by `margin`.
@@ -53,7 +52,7 @@ class KdTree:
         yield from self._route(columns, core, halo, margin)
 
     def _route(
-        self, columns: tuple[Points, ...], core: Rows, halo: Rows, margin: float
+        self, columns: tuple[Float32, ...], core: Rows, halo: Rows, margin: float
     ) -> Iterator[tuple[Rows, Rows]]:
         if not (self.below and self.above):
             yield core, np.sort(halo)
@@ -102,7 +101,7 @@ class KdTree:
         return cls(int(axis), float(at), cls.from_json(below), cls.from_json(above))
 
 
-def cut_tree(points: Points, rows_each: float, most: int) -> KdTree:
+def cut_tree(points: Float32, rows_each: float, most: int) -> KdTree:
     """Cut until no leaf is expected to hold more than `most` rows, unless all its points coincide.
 
     Each cut is along the longest side, at the quantile that gives both parts whole numbers of tiles. The
@@ -132,7 +131,7 @@ def parts_of(points: int, rows_each: float, most: int) -> int:
     return parts
 
 
-def _find_between(values: Points, rank: float) -> np.float32 | None:
+def _find_between(values: Float32, rank: float) -> np.float32 | None:
     """Return the value, other than the minimum, whose rank is nearest to `rank`."""
     middle = values[min(int(rank), len(values) - 1)]
     first = int(np.searchsorted(values, middle, "left"))
@@ -144,7 +143,7 @@ def _find_between(values: Points, rank: float) -> np.float32 | None:
     return value
 
 
-def margin_of(tree: KdTree, points: Points) -> float:
+def margin_of(tree: KdTree, points: Float32) -> float:
     """Return the margin of halos: 3 % of the tiles' median √(ab), where a and b are the longer sides."""
     if tree.leaves == 1:
         return 0.0
@@ -167,10 +166,10 @@ class Sampler:
         self.limit = min(1 << 32, max(1, (size << 32) // max(1, count)))
         self._most = 2 * size
         self._held = 0
-        self._points: list[Points] = []
+        self._points: list[Float32] = []
         self._hashes: list[NDArray[np.uint32]] = []
 
-    def add(self, points: Points) -> None:
+    def add(self, points: Float32) -> None:
         """Sample from (N, 3) float32 points, skipping points that are not finite."""
         hashes = _hash(points)
         chosen = np.isfinite(points).all(1)
@@ -188,13 +187,13 @@ class Sampler:
             self._hashes = [hashes[stay]]
             self._held = len(self._points[0])
 
-    def result(self) -> tuple[Points, float]:
+    def result(self) -> tuple[Float32, float]:
         """Return (n, 3) points, and the number of rows per point."""
         points = np.concatenate(self._points) if self._points else np.empty((0, 3), np.float32)
         return points, (1 << 32) / self.limit
 
 
-def _hash(points: Points) -> NDArray[np.uint32]:
+def _hash(points: Float32) -> NDArray[np.uint32]:
     """Hash each row's bits to (N,) uint32, finished like MurmurHash3."""
     bits = np.ascontiguousarray(points).view(np.uint32)
     h = bits[:, 0] * np.uint32(0x9E3779B1)

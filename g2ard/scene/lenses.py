@@ -6,9 +6,8 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
-Float = NDArray[np.float64]
+from g2ard.arrays import Float, Mask
 
 _SINGLE_FOCAL = ("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "SIMPLE_FISHEYE")
 
@@ -83,7 +82,7 @@ class PhotoLens:
     def turned(self, turn: Float) -> PhotoLens:
         return replace(self, turn=tuple(turn.ravel().tolist()))
 
-    def project(self, rays: Float) -> tuple[Float, NDArray[np.bool_]]:
+    def project(self, rays: Float) -> tuple[Float, Mask]:
         """Map (N, 3) rays in the view's axes to (N, 2) pixels, and say which of them the photo holds."""
         x, y, z = np.array(self.turn).reshape(3, 3) @ rays.T
         across = np.hypot(x, y)

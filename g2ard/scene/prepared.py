@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import g2ard._core as _core
+from g2ard.arrays import Float, Mask, Values
 from g2ard.errors import InputError
 from g2ard.scene.splats import Splats, unit_quats
 from g2ard.system.cached import cached_property
@@ -39,7 +40,7 @@ class PreparedScene(Splats):
         """Arrays of the scene and their order in Rust."""
         return _core.Scene(self._arrays)
 
-    def restore(self, order: NDArray[np.uint32], bounds: NDArray[np.float64]) -> None:
+    def restore(self, order: NDArray[np.uint32], bounds: Float) -> None:
         """Restore `core.order` and `core.bounds` of the same scene."""
         vars(self)["core"] = _core.Scene(self._arrays, (order, bounds.tolist()))
 
@@ -63,7 +64,7 @@ def _list_values(splats: Splats) -> dict[str, Any]:
     return {f.name: getattr(splats, f.name) for f in fields(splats)}
 
 
-def finite_rows_of(splats: Splats) -> tuple[PreparedScene, NDArray[np.bool_] | slice]:
+def finite_rows_of(splats: Splats) -> tuple[PreparedScene, Mask | slice]:
     """Return the finite rows of a scene, prepared, and their mask."""
     arrays = (splats.means, splats.quats, splats.scales, splats.sh0, splats.shN)
     everything = all(_are_finite(a) for a in arrays) and not np.isnan(splats.logit_opacities).any()
@@ -99,7 +100,7 @@ def with_some_opacity(scene: PreparedScene) -> PreparedScene:
     )
 
 
-def _are_finite(values: NDArray[Any]) -> bool:
+def _are_finite(values: Values) -> bool:
     """Return whether all values are finite; tests the sum first, which is faster."""
     with np.errstate(over="ignore", invalid="ignore"):
         return bool(np.isfinite(values.sum()) or np.isfinite(values).all())

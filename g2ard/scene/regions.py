@@ -5,8 +5,8 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from g2ard.arrays import Mask
 from g2ard.errors import InputError
 from g2ard.scene.samples import weighted_quantile
 from g2ard.scene.shape import longer_axes
@@ -61,7 +61,7 @@ def as_regions(given: Sequence[Any]) -> tuple[Region, ...]:
         ) from None
 
 
-def in_any(splats: Splats, regions: Sequence[Region]) -> NDArray[np.bool_]:
+def in_any(splats: Splats, regions: Sequence[Region]) -> Mask:
     """Return the (N,) mask of means in any of the regions.
 
     >>> pair = Splats.create([[0, 0, 0], [5, 0, 0]], scales=np.ones((2, 3)))
@@ -77,7 +77,7 @@ def in_any(splats: Splats, regions: Sequence[Region]) -> NDArray[np.bool_]:
     return inside
 
 
-def sky_mask(splats: Splats) -> NDArray[np.bool_]:
+def sky_mask(splats: Splats) -> Mask:
     """Return an (N,) mask of the sky and the far background; none of the rows if there is neither.
 
     From everywhere in the near scene these Gaussians stand behind it, and at almost the same distance.

@@ -5,16 +5,15 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from g2ard.arrays import Float, Int, Rows, Values
 from g2ard.scene.splats import Splats
-
-Floats = NDArray[np.float64]
 
 _GOLDEN = (np.sqrt(5) - 1) / 2
 
 
-def quantile(values: Floats, weights: Floats, shares: Any) -> Floats:
+def quantile(values: Float, weights: Float, shares: Any) -> Float:
     """Return the values below which the given shares of the weight lie.
 
     >>> quantile(np.array([3.0, 1.0, 2.0]), np.array([1.0, 1.0, 2.0]), [0.2, 0.5, 1.0]).tolist()
@@ -26,13 +25,13 @@ def quantile(values: Floats, weights: Floats, shares: Any) -> Floats:
     return values[order][np.minimum(at, len(order) - 1)]
 
 
-def middle(values: Floats) -> Any:
+def middle(values: Float) -> Any:
     """Return the lower median along the first axis, which is always one of the values."""
     rank = (len(values) - 1) // 2
     return np.partition(values, rank, axis=0)[rank]
 
 
-def joined(root: NDArray[np.int64], a: NDArray[Any], b: NDArray[Any]) -> NDArray[np.int64]:
+def joined(root: Int, a: Values, b: Values) -> Int:
     """Join groups by edges a–b, where `root` is the smallest row of each row's group.
 
     >>> joined(np.arange(5), np.array([3, 1]), np.array([4, 3])).tolist()
@@ -52,27 +51,27 @@ def joined(root: NDArray[np.int64], a: NDArray[Any], b: NDArray[Any]) -> NDArray
             root = further
 
 
-def along(vectors: Floats, axis: Floats) -> Floats:
+def along(vectors: Float, axis: Float) -> Float:
     """Return (M,) dot products with one axis. A matrix product may change bits with the number of threads."""
     return vectors[:, 0] * axis[0] + vectors[:, 1] * axis[1] + vectors[:, 2] * axis[2]
 
 
-def norms(vectors: Floats) -> Floats:
+def norms(vectors: Float) -> Float:
     """Return (M,) lengths of rows."""
     return np.sqrt(sum(column * column for column in vectors.T))
 
 
-def turned(vectors: Floats, axes: Floats) -> Floats:
+def turned(vectors: Float, axes: Float) -> Float:
     """Return (M, 3) coordinates along the three rows of `axes`."""
     return np.stack([along(vectors, axis) for axis in axes], axis=1)
 
 
-def moments(vectors: Floats, weights: Floats) -> Floats:
+def moments(vectors: Float, weights: Float) -> Float:
     """Return the (D, D) weighted sum of outer products of (M, D) rows."""
     return np.array([[(weights * a * b).sum() for b in vectors.T] for a in vectors.T])
 
 
-def between(ends: Any, share: Floats) -> Floats:
+def between(ends: Any, share: Float) -> Float:
     """Return points between two ends.
 
     >>> float(between((10, 20), 0.3))
@@ -81,13 +80,13 @@ def between(ends: Any, share: Floats) -> Floats:
     return ends[0] + (ends[1] - ends[0]) * share
 
 
-def directions(turn: Floats, level: Floats, height: ArrayLike) -> Floats:
+def directions(turn: Float, level: Float, height: ArrayLike) -> Float:
     """Return (M, 3) vectors at `turn` turns around z, of lengths `level` across it and `height` along it."""
     around = 2 * np.pi * turn
     return np.stack([level * np.cos(around), level * np.sin(around), height], axis=1)
 
 
-def around(vector: Floats, angles: Floats) -> Floats:
+def around(vector: Float, angles: Float) -> Float:
     """Return (K, 3): a vector turned around z by K angles, radians.
 
     >>> around(np.array([1.0, 0.0, 5.0]), np.array([0.0, np.pi / 2, np.pi])).round(9).tolist()
@@ -99,7 +98,7 @@ def around(vector: Floats, angles: Floats) -> Floats:
     return np.stack([x * cosine - y * sine, x * sine + y * cosine, np.full(len(angles), z)], axis=1)
 
 
-def fibonacci(count: int, low: float = -1.0, high: float = 1.0) -> Floats:
+def fibonacci(count: int, low: float = -1.0, high: float = 1.0) -> Float:
     """Return (count, 3) unit vectors, each representing the same area of the sphere.
 
     They cover the heights z from `high` down to `low`.
@@ -109,7 +108,7 @@ def fibonacci(count: int, low: float = -1.0, high: float = 1.0) -> Floats:
     return directions(steps * _GOLDEN % 1, np.sqrt(1 - z * z), z)
 
 
-def halton(start: int, stop: int, dimensions: int, seed: int) -> Floats:
+def halton(start: int, stop: int, dimensions: int, seed: int) -> Float:
     """Return (stop − start, dimensions) points of Halton's endless sequence in the unit cube.
 
     `dimensions` is at most 6. The points are shifted on the torus by `seed`.
@@ -127,14 +126,14 @@ def halton(start: int, stop: int, dimensions: int, seed: int) -> Floats:
     return (columns + shift) % 1
 
 
-def strata(features: Floats, size: int, seed: int) -> NDArray[Any]:
+def strata(features: Float, size: int, seed: int) -> Values:
     """Return an order in which every `size`-th row is a fair sample of all.
 
     The rows are halved along the widest feature into groups of at most `size` similar rows. In each group, a
     random row comes first and the others follow.
     """
     chance = np.random.default_rng(seed)
-    groups: list[NDArray[Any]] = []
+    groups: list[Values] = []
     todo = [np.arange(len(features))]
     while todo:
         rows = todo.pop()
@@ -148,7 +147,7 @@ def strata(features: Floats, size: int, seed: int) -> NDArray[Any]:
     return np.concatenate(groups)
 
 
-def merge_equal(points: Floats, colors: NDArray[Any]) -> tuple[NDArray[np.intp], NDArray[Any]]:
+def merge_equal(points: Float, colors: Values) -> tuple[Rows, Values]:
     """Return the first row of each position, ascending, and the mean colour there.
 
     Positions are equal if their float32 values are, which is all that a scene can hold.
@@ -172,7 +171,7 @@ def merge_equal(points: Floats, colors: NDArray[Any]) -> tuple[NDArray[np.intp],
     return np.sort(firsts), np.stack(totals, axis=1) / np.bincount(group)[:, None]
 
 
-def canonical_order(splats: Splats, rows: NDArray[Any], most: int | None = None) -> NDArray[Any]:
+def canonical_order(splats: Splats, rows: Values, most: int | None = None) -> Values:
     """Return an order of rows by a hash of opacity, rotation and colour; ties by place and size.
 
     Moving or scaling a scene keeps the order. Sums in it do not depend on the file's row order, and a prefix

@@ -1,9 +1,10 @@
 """Evenly spaced indices and samples, and weighted quantiles."""
 
-from typing import Any, Protocol, TypeVar
+from typing import Protocol, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
+
+from g2ard.arrays import Int, Values
 
 T = TypeVar("T")
 T_co = TypeVar("T_co", covariant=True)
@@ -22,19 +23,19 @@ def evenly_spaced(count: int, most: int, *, floor: bool = False) -> list[int]:
     return indices
 
 
-class Rows(Protocol[T_co]):
-    """Rows that can be taken, such as Gaussians or views."""
+class Takeable(Protocol[T_co]):
+    """Takeable that can be taken, such as Gaussians or views."""
 
     def __len__(self) -> int: ...
-    def take(self, index: NDArray[np.int64], /) -> T_co: ...
+    def take(self, index: Int, /) -> T_co: ...
 
 
-def take_evenly(rows: Rows[T], most: int, *, floor: bool = False) -> T:
+def take_evenly(rows: Takeable[T], most: int, *, floor: bool = False) -> T:
     """Return at most `most` Gaussians or views, see `evenly_spaced`."""
     return rows.take(np.array(evenly_spaced(len(rows), most, floor=floor), np.int64))
 
 
-def spread(count: int) -> NDArray[np.int64]:
+def spread(count: int) -> Int:
     """Return the indices below `count` in an order of which every prefix is spread evenly (van der Corput's).
 
     >>> spread(6).tolist(), spread(0).tolist()
@@ -47,7 +48,7 @@ def spread(count: int) -> NDArray[np.int64]:
     return order[order < count]
 
 
-def weighted_quantile(values: NDArray[Any], weights: NDArray[Any], share: float) -> float:
+def weighted_quantile(values: Values, weights: Values, share: float) -> float:
     """Return the value below which the share of the weight lies.
 
     >>> weighted_quantile(np.array([3.0, 1.0, 2.0]), np.array([1.0, 1.0, 2.0]), 0.5)

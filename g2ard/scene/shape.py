@@ -1,9 +1,8 @@
 """Shapes of Gaussians: needles, the effective rank, and the two longer axes."""
 
-from typing import Any
-
 import numpy as np
-from numpy.typing import NDArray
+
+from g2ard.arrays import Float, Float32, Values
 
 NEEDLE_RANK = 1.1
 """Effective rank below which reports count a Gaussian as a needle."""
@@ -16,7 +15,7 @@ NEEDLE_UNIT = 1e-2
 length."""
 
 
-def longer_axes(scales: NDArray[Any]) -> NDArray[Any]:
+def longer_axes(scales: Values) -> Values:
     """Return the (N, 2) scales of the two longer axes, ascending.
 
     >>> longer_axes(np.array([[3, 1, 2]])).tolist()
@@ -25,7 +24,7 @@ def longer_axes(scales: NDArray[Any]) -> NDArray[Any]:
     return np.sort(scales, axis=1)[:, 1:]
 
 
-def elongation(scales: NDArray[Any]) -> NDArray[np.float64]:
+def elongation(scales: Values) -> Float:
     """Return (N,) the largest over the middle of (N, 3) scales, infinite if only the middle one is 0.
 
     >>> elongation(np.array([[3, 1, 2]])).tolist()
@@ -36,7 +35,7 @@ def elongation(scales: NDArray[Any]) -> NDArray[np.float64]:
         return np.asarray(largest / middle)
 
 
-def effective_rank(scales: NDArray[np.float32]) -> NDArray[np.float64]:
+def effective_rank(scales: Float32) -> Float:
     """Return (N,) exp(−Σ q log q), q = s/Σs, in [1, 3].
 
     >>> effective_rank(np.array([[1, 1, 1], [1, 1, 1e-9], [1, 1e-9, 1e-9]])).round(3).tolist()
@@ -47,6 +46,6 @@ def effective_rank(scales: NDArray[np.float32]) -> NDArray[np.float64]:
     return np.exp(-(q * np.log(np.maximum(q, np.finfo(np.float64).tiny))).sum(1))
 
 
-def needle_share(scales: NDArray[np.float32]) -> float:
+def needle_share(scales: Float32) -> float:
     """Return the share of needles: Gaussians whose effective rank is below `NEEDLE_RANK`."""
     return float((effective_rank(scales) < NEEDLE_RANK).mean()) if len(scales) else 0.0

@@ -6,8 +6,9 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from g2ard.arrays import Float, Float32, Mask, Values
 from g2ard.config.choices import AXES, RENDER_MODELS, Axes, RenderModel
 from g2ard.errors import InputError, require
 from g2ard.progress import plural
@@ -67,13 +68,13 @@ class Splats(Shown):
     (2, 0, array([0.5, 0.5], dtype=float32))
     """
 
-    means: NDArray[Any]
-    quats: NDArray[np.float32]
-    scales: NDArray[np.float32]
-    logit_opacities: NDArray[np.float32]
-    sh0: NDArray[np.float32]
-    shN: NDArray[np.float32]
-    offset: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
+    means: Values
+    quats: Float32
+    scales: Float32
+    logit_opacities: Float32
+    sh0: Float32
+    shN: Float32
+    offset: Float = field(default_factory=lambda: np.zeros(3))
     render_model: RenderModel = "classic"
     up: tuple[float, float, float] | None = field(default=None, metadata=UNKEYED)
     axes: Axes = field(default="RDF", metadata=UNKEYED)
@@ -82,7 +83,8 @@ class Splats(Shown):
         for name in ARRAYS:
             object.__setattr__(self, name, _as_floats(name, getattr(self, name)))
         offset = _as_floats("offset", self.offset, np.float64)
-        require("offset", self.offset, offset.shape == (3,) and np.isfinite(offset).all(), "3 finite numbers")
+        is_point = offset.shape == (3,) and bool(np.isfinite(offset).all())
+        require("offset", self.offset, is_point, "3 finite numbers")
         object.__setattr__(self, "offset", offset)
         require("means", self.means.shape, self.means.ndim == 2 and self.means.shape[1] == 3, "shape (N, 3)")
         n = len(self.means)
@@ -121,7 +123,7 @@ class Splats(Shown):
         points = np.ascontiguousarray(points)
         n = len(points)
 
-        def rows(value: ArrayLike | None, default: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.float32]:
+        def rows(value: ArrayLike | None, default: ArrayLike, shape: tuple[int, ...]) -> Float32:
             if value is None:
                 return np.ascontiguousarray(np.broadcast_to(np.asarray(default, np.float32), shape))
             return np.ascontiguousarray(value, dtype=np.float32)
@@ -154,24 +156,24 @@ class Splats(Shown):
         return self.render_model == "antialiased"
 
     @property
-    def opacities(self) -> NDArray[np.float32]:
+    def opacities(self) -> Float32:
         """Opacities in [0, 1], (N,): the sigmoid of `logit_opacities`, without overflow."""
         x = self.logit_opacities.astype(np.float64)
         e = np.exp(-np.abs(x))
         return np.where(x >= 0, 1 / (1 + e), e / (1 + e)).astype(np.float32)
 
     @property
-    def log_scales(self) -> NDArray[np.float32]:
+    def log_scales(self) -> Float32:
         """Natural logarithms of `scales`, (N, 3), as files store them."""
         return np.log(self.scales.astype(np.float64)).astype(np.float32)
 
     @property
-    def colors(self) -> NDArray[np.float32]:
+    def colors(self) -> Float32:
         """Base colours 0.5 + SH_C0·sh0, (N, 3), not clamped."""
         return (0.5 + SH_C0 * self.sh0[:, 0]).astype(np.float32)
 
     @property
-    def positions(self) -> NDArray[np.float64]:
+    def positions(self) -> Float:
         """Means in world coordinates, (N, 3): with the offset."""
         return self.means.astype(np.float64) + self.offset
 
@@ -244,7 +246,7 @@ class Splats(Shown):
         moved = self.recentred(offset)
         return replace(moved, means=np.ascontiguousarray(moved.means, np.float32))
 
-    def finite_rows(self) -> NDArray[np.bool_]:
+    def finite_rows(self) -> Mask:
         """Return the (N,) mask of rows with finite values; infinite logits count as finite (α = 0 or 1)."""
         ok = np.isfinite(self.means).all(1) & ~np.isnan(self.logit_opacities)
         for name in ("quats", "scales", "sh0", "shN"):
@@ -273,7 +275,7 @@ def scene_of(scene: Splats | HasSplats, parameter: str = "splats") -> Splats:
     return found
 
 
-def _as_floats(name: str, values: Any, kind: type[Any] | None = None) -> NDArray[Any]:
+def _as_floats(name: str, values: Any, kind: type[Any] | None = None) -> Values:
     """Return an array as float32; as `kind`, if given; means of more than 24 bits as float64."""
     dtype = getattr(values, "dtype", None)
     if kind is None:
@@ -299,7 +301,7 @@ def check_finite(splats: Splats, parameter: str) -> None:
         raise InputError(text, parameter=parameter, index=int(bad[0]))
 
 
-def unit_colors(colors: ArrayLike) -> NDArray[np.float64]:
+def unit_colors(colors: ArrayLike) -> Float:
     """Return colours in [0, 1]: bytes divided by 255, 16-bit integers by 65,535, others as they are.
 
     >>> unit_colors(np.uint8([[255, 51, 0]])).tolist()
@@ -323,7 +325,7 @@ def unit_colors(colors: ArrayLike) -> NDArray[np.float64]:
     return values
 
 
-def far_middle(points: NDArray[Any], size: float = 0.0) -> NDArray[np.float64]:
+def far_middle(points: Values, size: float = 0.0) -> Float:
     """Return the median of (N, 3) points far from the origin, in whole units; zero for others.
 
     Points are far if it exceeds 16 times their spread: float32 then loses 4 bits and more. For points less
@@ -351,7 +353,7 @@ def far_middle(points: NDArray[Any], size: float = 0.0) -> NDArray[np.float64]:
     return np.rint(middle / unit) * unit
 
 
-def unit_quats(quats: NDArray[np.float32]) -> NDArray[np.float32]:
+def unit_quats(quats: Float32) -> Float32:
     """Normalise (N, 4) quaternions wxyz.
 
     Rows within 1e-6 of length 1 keep every bit, so that writing and reading change nothing. Zeros become the

@@ -13,6 +13,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from g2ard.arrays import Float, Float32, Mask
 from g2ard.config.choices import AXES, NAMED_AXES, Axes, RenderModel
 from g2ard.errors import InputError, require
 from g2ard.scene.splats import ARRAYS, Splats
@@ -69,7 +70,7 @@ def transform(splats: Splats, matrix: ArrayLike) -> Splats:
     )
 
 
-def moving(scale: float, degrees: Sequence[float], shift: Sequence[float]) -> NDArray[np.float64]:
+def moving(scale: float, degrees: Sequence[float], shift: Sequence[float]) -> Float:
     """Return the 4×4 matrix that scales, then rotates about x, y and z in turn, then moves.
 
     >>> moving(2, (0, 0, 90), (5, 0, 0)).round(6)[:2].tolist()
@@ -87,14 +88,14 @@ def moving(scale: float, degrees: Sequence[float], shift: Sequence[float]) -> ND
     return out
 
 
-def placed(splats: Splats, matrix: NDArray[np.float64]) -> Splats:
+def placed(splats: Splats, matrix: Float) -> Splats:
     """Apply a 4×4 similarity like `transform`; a mere translation only changes `offset`."""
     if (matrix[:3, :3] == np.eye(3)).all():
         return replace(splats, offset=splats.offset + matrix[:3, 3])
     return transform(splats, matrix)
 
 
-def deformed(splats: Splats, matrix: NDArray[np.float64]) -> tuple[Splats, bool]:
+def deformed(splats: Splats, matrix: Float) -> tuple[Splats, bool]:
     """Apply any invertible 4×4 affine map like `placed`; return whether harmonics follow it exactly.
 
     Covariances become MΣMᵀ. Harmonics follow rotations and mirrors exactly; for other maps, bands 1 to 3 are
@@ -127,7 +128,7 @@ def deformed(splats: Splats, matrix: NDArray[np.float64]) -> tuple[Splats, bool]
     ), exact
 
 
-def _warp(shN: NDArray[np.float32], linear: NDArray[np.float64]) -> NDArray[np.float32]:
+def _warp(shN: Float32, linear: Float) -> Float32:
     """Fit coefficients of bands 1 to 3 to c'(d) = c(M⁻¹·d) over many directions."""
     directions = np.random.default_rng(0).normal(size=(512, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
@@ -140,7 +141,7 @@ def _warp(shN: NDArray[np.float32], linear: NDArray[np.float64]) -> NDArray[np.f
     return np.einsum("kj,njc->nkc", turn, shN.astype(np.float64)).astype(np.float32)
 
 
-def _to_quaternions(rotations: NDArray[np.float64]) -> NDArray[np.float32]:
+def _to_quaternions(rotations: Float) -> Float32:
     """Return (N, 4) wxyz of (N, 3, 3) rotations, by the largest of the four components."""
     r = rotations
     trace = r[:, 0, 0] + r[:, 1, 1] + r[:, 2, 2]
@@ -159,7 +160,7 @@ def _to_quaternions(rotations: NDArray[np.float64]) -> NDArray[np.float32]:
     return (quats / np.linalg.norm(quats, axis=1, keepdims=True)).astype(np.float32)
 
 
-def similarity(matrix: ArrayLike) -> tuple[float, NDArray[np.float64], NDArray[np.float64]]:
+def similarity(matrix: ArrayLike) -> tuple[float, Float, Float]:
     """Decompose a 4×4 matrix into s, R (3, 3) and t (3,), or raise an `InputError` if it is no similarity."""
     m = np.asarray(matrix, np.float64)
     if m.shape != (4, 4) or not np.isfinite(m).all() or not np.allclose(m[3], [0, 0, 0, 1]):
@@ -180,7 +181,7 @@ def similarity(matrix: ArrayLike) -> tuple[float, NDArray[np.float64], NDArray[n
     return scale, u @ v, m[:3, 3]
 
 
-def unit_up(up: ArrayLike) -> NDArray[np.float64]:
+def unit_up(up: ArrayLike) -> Float:
     """Return the (3,) unit vector of an up direction, after checking it."""
     axis = np.asarray(up, np.float64)
     if axis.shape != (3,) or not np.isfinite(axis).all() or not axis.any():
@@ -188,7 +189,7 @@ def unit_up(up: ArrayLike) -> NDArray[np.float64]:
     return np.asarray(axis / np.linalg.norm(axis))
 
 
-def quaternion_of(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
+def quaternion_of(rotation: Float) -> Float:
     """Return (4,) wxyz: the eigenvector of the largest eigenvalue of Bar-Itzhack's matrix."""
     r = rotation
     k = np.array(
@@ -199,11 +200,11 @@ def quaternion_of(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
             [0, 0, 0, r[2, 2] - r[0, 0] - r[1, 1]],
         ]
     )
-    q: NDArray[np.float64] = np.linalg.eigh(np.triu(k) + np.triu(k, 1).T)[1][:, -1]
+    q: Float = np.linalg.eigh(np.triu(k) + np.triu(k, 1).T)[1][:, -1]
     return q if q[0] >= 0 else -q
 
 
-def rotation_matrices(quats: NDArray[np.floating]) -> NDArray[np.float64]:
+def rotation_matrices(quats: NDArray[np.floating]) -> Float:
     """Return (N, 3, 3) matrices of (N, 4) wxyz quaternions of any length; zero is the identity."""
     q = quats.astype(np.float64)
     largest = np.abs(q).max(1, keepdims=True)
@@ -217,7 +218,7 @@ def rotation_matrices(quats: NDArray[np.floating]) -> NDArray[np.float64]:
     return np.stack([np.stack(row, -1) for row in rows], -2)
 
 
-def rotate_harmonics(shN: NDArray[np.float32], rotation: NDArray[np.float64]) -> NDArray[np.float32]:
+def rotate_harmonics(shN: Float32, rotation: Float) -> Float32:
     """Rotate the coefficients of bands 1 to 3 by R: c'(d) = c(R⁻¹·d).
 
     Bands rotate separately: the matrix M of a band solves Y(d)·M = Y(R⁻¹·d) by least squares over many
@@ -237,7 +238,7 @@ def rotate_harmonics(shN: NDArray[np.float32], rotation: NDArray[np.float64]) ->
     return out
 
 
-def harmonic_signs(axes: Iterable[float]) -> NDArray[np.float32]:
+def harmonic_signs(axes: Iterable[float]) -> Float32:
     """Return the (15,) signs of the coefficients of bands 1 to 3 when axes x, y and z get these signs.
 
     >>> harmonic_signs((1, -1, -1))[:3].tolist()
@@ -247,7 +248,7 @@ def harmonic_signs(axes: Iterable[float]) -> NDArray[np.float32]:
     return np.array([math.prod(signs[axis] for axis in odd) for odd in _ODD], np.float32)
 
 
-def _evaluate_basis(d: NDArray[np.float64]) -> NDArray[np.float64]:
+def _evaluate_basis(d: Float) -> Float:
     """Return the (N, 15) real harmonics of bands 1 to 3 at unit vectors."""
     x, y, z = d.T
     xx = x * x
@@ -270,7 +271,7 @@ def _evaluate_basis(d: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.stack(columns, axis=1)
 
 
-def change_of_axes(source: str, target: str) -> NDArray[np.float64]:
+def change_of_axes(source: str, target: str) -> Float:
     """Return the (3, 3) matrix from coordinates in one system to those in another; it may mirror.
 
     >>> change_of_axes("RUB", "RFU") @ [1, 2, 3]
@@ -285,7 +286,7 @@ def change_of_axes(source: str, target: str) -> NDArray[np.float64]:
     return there @ here.T
 
 
-def with_axes(splats: Splats, matrix: NDArray[np.float64]) -> Splats:
+def with_axes(splats: Splats, matrix: Float) -> Splats:
     """Return a scene in other axes, by a matrix M of `change_of_axes`.
 
     A Gaussian's frame R becomes M·R·Mᵀ, and its scales change places as the axes do. So quaternions keep
@@ -337,7 +338,7 @@ def stand_as(splats: Splats, other: HasAxes) -> Splats:
     return replace(splats, up=other.up, axes=other.axes)
 
 
-def moved_axes(offset: ArrayLike, source: Axes, target: Axes) -> NDArray[np.float64]:
+def moved_axes(offset: ArrayLike, source: Axes, target: Axes) -> Float:
     """Return a (3,) offset in other axes, exactly.
 
     >>> moved_axes([5.0, 7.0, 2.0], "RFU", "RDF").tolist()
@@ -402,12 +403,12 @@ def one_model(models: Sequence[RenderModel]) -> RenderModel:
     return models[0]
 
 
-def in_box(splats: Splats, low: ArrayLike, high: ArrayLike) -> NDArray[np.bool_]:
+def in_box(splats: Splats, low: ArrayLike, high: ArrayLike) -> Mask:
     """Return the (N,) mask of means in an axis-aligned box (inclusive), world coordinates."""
     return within_box(splats.positions, low, high)
 
 
-def within_box(world: NDArray[np.float64], low: ArrayLike, high: ArrayLike) -> NDArray[np.bool_]:
+def within_box(world: Float, low: ArrayLike, high: ArrayLike) -> Mask:
     """Return the (N,) mask of (N, 3) positions in an axis-aligned box (inclusive)."""
     low, high = (np.asarray(v, np.float64) for v in (low, high))
     if not (low <= high).all():
@@ -415,11 +416,11 @@ def within_box(world: NDArray[np.float64], low: ArrayLike, high: ArrayLike) -> N
             f"from {low.tolist()} to {high.tolist()} holds nothing; the lower corner comes first",
             parameter="box",
         )
-    inside: NDArray[np.bool_] = np.all((world >= low) & (world <= high), axis=1)
+    inside: Mask = np.all((world >= low) & (world <= high), axis=1)
     return inside
 
 
-def in_sphere(splats: Splats, center: ArrayLike, radius: float) -> NDArray[np.bool_]:
+def in_sphere(splats: Splats, center: ArrayLike, radius: float) -> Mask:
     """Return the (N,) mask of means within `radius` of `center`, world coordinates."""
     if not radius > 0:
         raise InputError(f"expected a radius > 0, got {radius:g}", parameter="sphere")

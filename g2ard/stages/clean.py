@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import g2ard._core as _core
+from g2ard.arrays import Float, Float32, Mask, Rows, Values
 from g2ard.errors import InputError, require
 from g2ard.progress import Progress, counter, silent
 from g2ard.rendering.renderer import Renderer
@@ -33,7 +34,7 @@ KINDS = ("invisible", "giant", "needle", "floater", "haze", "streak")
 FLOATING = ("haze", "streak")
 """Kinds that are found only with a strength."""
 
-_Floating = tuple[NDArray[np.float64], NDArray[np.float64]]
+_Floating = tuple[Float, Float]
 
 _HALF_STEP = 0.5 / 255
 """Half an 8-bit step."""
@@ -60,7 +61,7 @@ class Cleaning:
     kind: NDArray[np.int8]
 
     @property
-    def keep(self) -> NDArray[np.bool_]:
+    def keep(self) -> Mask:
         """(N,) mask of the Gaussians to keep."""
         return self.kind < 0
 
@@ -73,7 +74,7 @@ class Cleaning:
 def find_clutter(
     splats: Splats,
     seen: Any,
-    unoccluded: NDArray[np.bool_],
+    unoccluded: Mask,
     pixels: int,
     kinds: tuple[str, ...] = KINDS,
     *,
@@ -121,9 +122,7 @@ def find_clutter(
     return Cleaning(kind)
 
 
-def _mark_invisible(
-    splats: Splats, seen: Any, unoccluded: NDArray[np.bool_], pixels: int
-) -> NDArray[np.bool_]:
+def _mark_invisible(splats: Splats, seen: Any, unoccluded: Mask, pixels: int) -> Mask:
     """Mark Gaussians that no renderer draws, and the weakest ones that change no pixel by half an 8-bit step.
 
     The latter are taken in order of light until together they would change the mean pixel by half a step.
@@ -132,14 +131,14 @@ def _mark_invisible(
     small = np.flatnonzero(unoccluded & ~faint & (seen.peak < _HALF_STEP))
     order = small[np.argsort(seen.weight[small], kind="stable")]
     total = np.cumsum(seen.weight[order], dtype=np.float64)
-    out: NDArray[np.bool_] = faint.copy()
+    out: Mask = faint.copy()
     out[order[total <= _HALF_STEP * pixels]] = True
     return out
 
 
 def compare_depths(
     splats: Splats, cameras: Cameras, *, floating: bool = True, progress: Progress = silent
-) -> tuple[NDArray[np.bool_], _Floating | None]:
+) -> tuple[Mask, _Floating | None]:
     """Compare the Gaussians' depths in each view with those of the visible surface.
 
     The surface is where half of a pixel's light is blocked. A mean is unoccluded if it is in the frame of a
@@ -195,9 +194,7 @@ def compare_depths(
     return unoccluded, (shares[:count], ends)
 
 
-def _find_in_frame(
-    points: NDArray[np.float64], camera: Camera, depths: NDArray[np.float32]
-) -> tuple[NDArray[np.intp], NDArray[np.float64], NDArray[np.float32]]:
+def _find_in_frame(points: Float, camera: Camera, depths: Float32) -> tuple[Rows, Float, Float32]:
     """Return the rows of points in the frame, their depths, and the surface's depths at their pixels."""
     x, y, z = camera.viewmat[:3, :3] @ points.T + camera.viewmat[:3, 3:]
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -214,7 +211,7 @@ def extent_of(splats: Splats) -> tuple[list[float], float]:
     return middle.tolist(), float(np.percentile(np.linalg.norm(means - middle, axis=1), 99))
 
 
-def _mark_giants(splats: Splats, middle: Sequence[float], radius: float) -> NDArray[np.bool_]:
+def _mark_giants(splats: Splats, middle: Sequence[float], radius: float) -> Mask:
     """Mark Gaussians larger than the scene, with its middle within 3σ."""
     means = splats.means.astype(np.float64)
     large = np.flatnonzero(splats.scales.max(axis=1) > radius)
@@ -225,7 +222,7 @@ def _mark_giants(splats: Splats, middle: Sequence[float], radius: float) -> NDAr
     return out
 
 
-def _mark_needles(splats: Splats, rest: NDArray[np.bool_], progress: Progress) -> NDArray[np.bool_]:
+def _mark_needles(splats: Splats, rest: Mask, progress: Progress) -> Mask:
     """Mark long, thin Gaussians of `rest` with both ends (2σ) beyond 3σ of their nearest neighbours.
 
     Neighbours count as spheres of their largest scale: by their true shape eight times as many were needles
@@ -250,7 +247,7 @@ def _mark_needles(splats: Splats, rest: NDArray[np.bool_], progress: Progress) -
     return out
 
 
-def _find_elongated(splats: Splats, rows: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
+def _find_elongated(splats: Splats, rows: Rows) -> tuple[Rows, Float]:
     """Return those of `rows` that are ten times as long as wide, and (n, 3) vectors from mean to end (2σ)."""
     width, length = longer_axes(splats.scales[rows].astype(np.float64)).T
     long = rows[length > NEEDLE_LENGTH * np.maximum(width, 1e-30)]
@@ -261,11 +258,11 @@ def _find_elongated(splats: Splats, rows: NDArray[np.intp]) -> tuple[NDArray[np.
 
 def _mark_floaters(
     splats: Splats,
-    rest: NDArray[np.bool_],
-    weight: NDArray[Any],
-    unoccluded: NDArray[np.bool_],
+    rest: Mask,
+    weight: Values,
+    unoccluded: Mask,
     progress: Progress = silent,
-) -> NDArray[np.bool_]:
+) -> Mask:
     """Mark small groups of touching Gaussians of `rest` (3σ spheres meet), some of them unoccluded."""
     out = np.zeros(len(splats), bool)
     rows = np.flatnonzero(rest)

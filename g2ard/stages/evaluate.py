@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 from typing import Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
+from g2ard.arrays import Float32
 from g2ard.config.checks import checks_arguments
 from g2ard.config.choices import BLACK, Colour
 from g2ard.errors import InputError
@@ -141,7 +141,7 @@ def evaluate(
     eight_bit: bool = False,
     progress: Progress = silent,
     stage: str = "evaluate",
-    watch: Callable[[int, ViewScore, NDArray[np.float32]], None] | None = None,
+    watch: Callable[[int, ViewScore, Float32], None] | None = None,
 ) -> Evaluation:
     """Render every view of `targets` and score it.
 
@@ -186,7 +186,7 @@ def evaluate(
     fill(targets, progress)
     renderer = Renderer(splats, background=background, settings=settings)
 
-    def score(view: int) -> tuple[ViewScore, NDArray[np.float32] | None]:
+    def score(view: int) -> tuple[ViewScore, Float32 | None]:
         name = cameras.names[view]
         image = rendered(renderer, targets, view)
         target = targets[view]

@@ -9,9 +9,10 @@ from dataclasses import dataclass, replace
 from typing import Annotated, cast
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 import g2ard._core as _core
+from g2ard.arrays import Float, Rows
 from g2ard.config.checks import Within, checks_arguments
 from g2ard.config.choices import NAMED_AXES, Axes, AxesName
 from g2ard.config.schema import Settings
@@ -102,7 +103,7 @@ def in_axes(splats: Splats, axes: Axes) -> Splats:
     return splats if axes == "RDF" else replace(splats, axes=axes)
 
 
-def guessed_axes(positions: NDArray[np.float64], progress: Progress = silent) -> Axes:
+def guessed_axes(positions: Float, progress: Progress = silent) -> Axes:
     """Guess the axes of points by their ground: z up, y up, or those of photos, y down."""
     some = positions[:: max(1, len(positions) // _GUESSED_BY)]
     discs, _ = lift_rows(some, np.full(some.shape, 0.5), LiftConfig(), progress)
@@ -121,7 +122,7 @@ def lift_rows(
     progress: Progress = silent,
     *,
     merge: bool = True,
-) -> tuple[Splats, NDArray[np.intp]]:
+) -> tuple[Splats, Rows]:
     """Lift points as `lift` does; also return the row of each disc's point, ascending.
 
     With `merge` false, points of one position become a disc each.
@@ -174,12 +175,12 @@ def isolated(splats: Splats) -> str | None:
     return f"{plural(count, 'isolated point')} {text}; remove strays first, as with CloudCompare's SOR filter"
 
 
-def _choose_anchor(points: NDArray[np.float64]) -> NDArray[np.float64]:
+def _choose_anchor(points: Float) -> Float:
     """Return a point amid others, a multiple of a power of two that is larger than the cells of lines.
 
     So cells are the same in tiles as in the whole cloud.
     """
     low, high = np.percentile(points, (1, 99), axis=0, method="lower")
     step = np.exp2(np.frexp(np.max(high - low) or 1.0)[1] - 2)
-    anchor: NDArray[np.float64] = np.rint(low / step) * step
+    anchor: Float = np.rint(low / step) * step
     return anchor

@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from g2ard.arrays import Float32
 from g2ard.errors import OutputError
 from g2ard.io.atomic import atomic_output, drop_temporaries
 from g2ard.io.detect import MANIFEST, PARTS
@@ -27,7 +28,7 @@ from g2ard.io.jsonfile import read_json
 from g2ard.io.stream import PointStream, SceneStream
 from g2ard.io.tile_store import FORMAT, VERSION, TileStore, halo_name, packed, row_width, tile_name
 from g2ard.progress import Progress, Say, plural
-from g2ard.scene.kdtree import KdTree, Points, Sampler, cut_tree, margin_of, parts_of
+from g2ard.scene.kdtree import KdTree, Sampler, cut_tree, margin_of, parts_of
 from g2ard.stages.lift import LiftConfig, lift_rows
 from g2ard.system.cached import cached_property
 from g2ard.system.keys import key_of
@@ -196,7 +197,7 @@ class Pouring:
             )
         return self._save_tree(tree, margin)
 
-    def _sample(self) -> tuple[Points, float]:
+    def _sample(self) -> tuple[Float32, float]:
         """Return a sample of positions, and the rows that each stands for."""
         files = self._run_parts("sample", "sample", {"count": self.stream.count, "size": _TREE_SAMPLE}, {})
         sampler = Sampler(self.stream.count, _TREE_SAMPLE)
@@ -345,7 +346,7 @@ def _select(files: Sequence[Path], counts: NDArray[np.int64]) -> list[Path]:
     return [path for path, count in zip(files, counts, strict=True) if count]
 
 
-def _get_positions(rows: NDArray[Any]) -> Points:
+def _get_positions(rows: NDArray[Any]) -> Float32:
     """Return the (n, 3) float32 positions with which rows begin."""
     return np.ascontiguousarray(rows["near"] if rows.dtype.names else rows[:, :3])
 

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
+from g2ard.arrays import Float, Float32, Mask, Rows
 from g2ard.io.paths import file_identity
 from g2ard.io.photos import load_photo
 from g2ard.io.sanitize import Tally
@@ -67,7 +67,7 @@ class ColoredStream(PointStream):
         self.channels = 3
 
     @cached_property
-    def hiding(self) -> NDArray[np.float64]:
+    def hiding(self) -> Float:
         """Points that hide others."""
         stride = max(1, self.count // _HIDING)
         read = 0
@@ -126,11 +126,11 @@ def _make_absolute(paths: Sequence[Path | None]) -> tuple[Path | None, ...]:
 
 
 def _with_photo_colors(
-    colors: NDArray[np.float32],
-    bare: NDArray[np.bool_],
-    found: NDArray[np.float32],
-    seen: NDArray[np.bool_],
-) -> NDArray[np.float32]:
+    colors: Float32,
+    bare: Mask,
+    found: Float32,
+    seen: Mask,
+) -> Float32:
     """Return colours with those that photos show; black that none shows becomes the usual colour."""
     black = not colors[bare].any()
     colors = colors.copy()
@@ -141,13 +141,13 @@ def _with_photo_colors(
 
 
 def median_colors(
-    positions: NDArray[np.float64],
-    wanted: NDArray[np.bool_],
+    positions: Float,
+    wanted: Mask,
     cameras: Cameras,
     progress: Progress = silent,
     *,
-    hiding: NDArray[np.float64] | None = None,
-) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    hiding: Float | None = None,
+) -> tuple[Float32, Mask]:
     """Return the (n, 3) median colours of the wanted points in photos that see them, and whether any does.
 
     Of each photo, all points are drawn into cells of a few; those behind the nearest of a cell are hidden.
@@ -190,9 +190,7 @@ def median_colors(
     return colors, count > 0
 
 
-def _find_seen(
-    positions: NDArray[np.float64], hiding: NDArray[np.float64], cameras: Cameras, view: int
-) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
+def _find_seen(positions: Float, hiding: Float, cameras: Cameras, view: int) -> tuple[Rows, Mask]:
     """Return (N, 2) columns and rows of points in a view, and whether they are inside and not hidden."""
     pixels, depth, inside = own = _project(positions, cameras, view)
     others, depths, drawn = own if hiding is positions else _project(hiding, cameras, view)
@@ -201,7 +199,7 @@ def _find_seen(
     side = max(1.0, np.sqrt(width * height * _CELL_POINTS / max(1, int(drawn.sum()))))
     across = int(width / side) + 1
 
-    def cells(at: NDArray[np.intp]) -> NDArray[np.intp]:
+    def cells(at: Rows) -> Rows:
         return (at[:, 1] / side).astype(np.intp) * across + (at[:, 0] / side).astype(np.intp)
 
     nearest = np.full(across * (int(height / side) + 1), np.inf)
@@ -209,9 +207,7 @@ def _find_seen(
     return pixels, inside & (depth <= (1 + _DEPTH_SLACK) * nearest[cells(pixels)])
 
 
-def _project(
-    positions: NDArray[np.float64], cameras: Cameras, view: int
-) -> tuple[NDArray[np.intp], NDArray[np.float64], NDArray[np.bool_]]:
+def _project(positions: Float, cameras: Cameras, view: int) -> tuple[Rows, Float, Mask]:
     """Return (N, 2) columns and rows of points in a view, their depths, and whether they are inside."""
     width = int(cameras.widths[view])
     height = int(cameras.heights[view])

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from g2ard.arrays import Float, Mask
 from g2ard.scene.cameras import Cameras
 
 _COARSE_VOXELS = 64
@@ -18,9 +18,6 @@ _EMPTY_VIEWS_SHARE = 0.02
 """Share of the views that may see a voxel as empty, because single outlines have errors."""
 _SEEING_VIEWS_SHARE = 0.25
 """Least share of the views that must contain a voxel."""
-
-Float = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,8 +9,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from g2ard.arrays import Float, Float32, Int, Mask
 from g2ard.config.choices import BLACK, Colour
 from g2ard.errors import InputError
 from g2ard.io.photos import composite, load_photo
@@ -18,7 +18,7 @@ from g2ard.io.types import Points
 from g2ard.progress import Progress, plural, silent
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.reproducible import merge_equal
-from g2ard.stages.photo_points.hull import Float, Mask, VisualHull, grown, visual_hull
+from g2ard.stages.photo_points.hull import VisualHull, grown, visual_hull
 
 _TRIAL_DEPTHS = 48
 _HULL_DEPTHS = 96
@@ -142,7 +142,7 @@ def _find_common_centre(cameras: Cameras) -> Float:
     return middle if before.mean() > 0.5 else ahead
 
 
-def _find_neighbours(cameras: Cameras, view: int) -> NDArray[np.int64]:
+def _find_neighbours(cameras: Cameras, view: int) -> Int:
     """Return the views nearest to one in position and direction."""
     away = np.linalg.norm(cameras.positions - cameras.positions[view], axis=1) / (cameras.extent or 1.0)
     turn = 1 - cameras.forwards @ cameras.forwards[view]
@@ -161,15 +161,13 @@ class _Photo:
         step: pixels from a patch's middle to its sides.
     """
 
-    image: NDArray[np.float32]
+    image: Float32
     valid: Mask
     starts: Mask
     step: int
 
     @classmethod
-    def of(
-        cls, image: NDArray[np.float32], mask: Mask | None, outline: Mask | None, background: Colour
-    ) -> _Photo:
+    def of(cls, image: Float32, mask: Mask | None, outline: Mask | None, background: Colour) -> _Photo:
         step = max(1, round(max(image.shape) / _PATCH_SPACING))
         shown = np.abs(image - background).max(2) > _EMPTY_COLOUR_SLACK if outline is None else outline
         if mask is None:
@@ -177,9 +175,7 @@ class _Photo:
         return cls(image, mask, shown & ~grown(~mask, step), step)
 
 
-def _sweep(
-    ray: _Rays, depths: Float, hull: VisualHull | None, slack: float
-) -> tuple[Float, NDArray[np.float32]]:
+def _sweep(ray: _Rays, depths: Float, hull: VisualHull | None, slack: float) -> tuple[Float, Float32]:
     """Return points on rays, with colours.
 
     Points lie within the hull if there is one. Without one, a point must agree with other photos, and
@@ -240,7 +236,7 @@ class _Rays:
 
     cameras: Cameras
     photos: list[_Photo]
-    others: NDArray[np.int64]
+    others: Int
     origin: Float
     aims: Float
     patches: Float
@@ -251,8 +247,8 @@ class _Rays:
         cameras: Cameras,
         shots: list[_Photo],
         view: int,
-        others: NDArray[np.int64],
-        pixels: NDArray[np.int64],
+        others: Int,
+        pixels: Int,
     ) -> _Rays:
         photo = shots[view].image
         pose = cameras.viewmats[view]
@@ -265,7 +261,7 @@ class _Rays:
         return cls(cameras, shots, others, cameras.positions[view], aims, patches)
 
     @property
-    def colors(self) -> NDArray[np.float32]:
+    def colors(self) -> Float32:
         """Colours of the pixels, (N, 3)."""
         return self.patches[:, 0].astype(np.float32)
 

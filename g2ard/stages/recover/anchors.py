@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
-from numpy.typing import NDArray
 
+from g2ard.arrays import Float32
 from g2ard.config.checks import AtLeastOne, NotNegative, Positive, Within
 from g2ard.config.schema import Settings
 from g2ard.errors import InputError, require
@@ -114,10 +114,10 @@ class Anchors:
         r_perp: (N,) float32 normal radius, the smallest scale.
     """
 
-    means: NDArray[np.float32]
-    frames: NDArray[np.float32]
-    r_parallel: NDArray[np.float32]
-    r_perp: NDArray[np.float32]
+    means: Float32
+    frames: Float32
+    r_parallel: Float32
+    r_perp: Float32
 
     @classmethod
     def of(cls, splats: Splats, in_plane: float = 3.0) -> Anchors:
@@ -140,7 +140,7 @@ class Anchors:
         )
 
 
-def drift95(anchors: Anchors, means: NDArray[np.float32]) -> float:
+def drift95(anchors: Anchors, means: Float32) -> float:
     """Return the 95th percentile of |δ̃₃| / r⊥, δ̃ = R̄ᵀ(μ − μ̄): distances from the surface in thicknesses."""
     if not len(means):
         return 0.0

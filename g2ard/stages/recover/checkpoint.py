@@ -10,8 +10,8 @@ from types import FrameType
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from g2ard.arrays import Values
 from g2ard.errors import InputError
 from g2ard.io.atomic import atomic_output
 from g2ard.io.reports import plain
@@ -23,7 +23,7 @@ PERIOD = 60.0
 """Seconds between two checkpoints."""
 
 
-def save(path: Path, key: str, meta: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> None:
+def save(path: Path, key: str, meta: dict[str, Any], arrays: dict[str, Values]) -> None:
     """Write a checkpoint; `key` identifies the run."""
     text = json.dumps({"key": key, **meta}, default=plain)
     everything: dict[str, Any] = {"meta": np.array(text), **arrays}

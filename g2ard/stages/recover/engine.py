@@ -1,12 +1,11 @@
 """Objective of recovery's engines, and the engine in Rust or on a GPU, which runs whole steps."""
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 import g2ard._core as _core
+from g2ard.arrays import Float32, Mask, Values
 from g2ard.rendering.renderer import RasterSettings, arrays_of, view_of
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.samples import evenly_spaced
@@ -18,7 +17,7 @@ from g2ard.stages.recover.config import Rates
 _MEASURED_VIEWS = 8
 
 
-def measure_radii(splats: Splats) -> NDArray[np.float32]:
+def measure_radii(splats: Splats) -> Float32:
     """Return (N,) √(s₁·s₂) of the two longer scales s₁ ≥ s₂, with s₂ at least s₁/100: the unit of a mean's
     rate.
 
@@ -100,7 +99,7 @@ class Objective(Photometric):
     anchors: Anchors
     regularizers: Regularizers
     means_in_scales: bool
-    frozen: NDArray[np.bool_] | None = None
+    frozen: Mask | None = None
     relative: bool = False
 
 
@@ -131,11 +130,11 @@ class FusedEngine:
     def step(
         self,
         view: int,
-        target: NDArray[np.float32],
+        target: Float32,
         rates: Rates,
         *,
         regularize: bool,
-        mask: NDArray[np.bool_] | None = None,
+        mask: Mask | None = None,
         fixed: bool = True,
     ) -> float:
         """Take one optimiser step on one view; return its photometric loss.
@@ -169,17 +168,17 @@ class FusedEngine:
             shN=shN,
         )
 
-    def state(self) -> dict[str, NDArray[Any]]:
+    def state(self) -> dict[str, Values]:
         """Return everything that a bitwise resume needs."""
         return {**self._trainer.state(), "skipped": np.array(self.skipped)}
 
-    def load(self, state: dict[str, NDArray[Any]]) -> None:
+    def load(self, state: dict[str, Values]) -> None:
         self._skipped_before = int(state["skipped"]) - self._trainer.skipped
         self._trainer.load(state)
         self._trainer.anchor(*self._anchors)
 
     @property
-    def counts(self) -> NDArray[Any]:
+    def counts(self) -> Values:
         """Number of steps that each Gaussian has taken, (N,)."""
         return self._trainer.state()["steps"]
 

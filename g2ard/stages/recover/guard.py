@@ -8,8 +8,9 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from g2ard.arrays import Float, Mask, Values
 from g2ard.rendering.renderer import arrays_of
 from g2ard.scene.splats import ARRAYS, Splats
 
@@ -59,7 +60,7 @@ class Guard:
     best: Splats
     before: float
     others: Callable[[Splats], dict[str, float]] | None = None
-    harmful: Callable[[Splats], NDArray[np.bool_] | None] = lambda scene: None
+    harmful: Callable[[Splats], Mask | None] = lambda scene: None
     active: bool = True
     looked: int = 0
     backed_off: list[dict[str, float]] = field(default_factory=list)
@@ -128,9 +129,7 @@ class Guard:
         before = self.validation[0]["psnr"]
         return min(scores[kind] - before[kind] for kind in before)
 
-    def choose_by_validation(
-        self, result: Splats, views: NDArray[np.float64], step: int
-    ) -> tuple[Splats, float | None]:
+    def choose_by_validation(self, result: Splats, views: Float, step: int) -> tuple[Splats, float | None]:
         """Decide how much of a result's changes to keep, by the validation views.
 
         Each Gaussian's change is multiplied by v/(v + k), where v `views` touched it (shrinkage towards the
@@ -174,16 +173,14 @@ class Guard:
         """Return the mean PSNR over training views, `trained`, and the kinds of validation views."""
         return (trained + sum(scores.values())) / (1 + len(scores))
 
-    def _find_least_harm(
-        self, result: Splats, views: NDArray[np.float64]
-    ) -> tuple[Splats, float | None, dict[str, float]]:
+    def _find_least_harm(self, result: Splats, views: Float) -> tuple[Splats, float | None, dict[str, float]]:
         """Return the candidate whose worst kind of validation views gains most, its k and its scores."""
         assert self.others is not None
         best = self.start
         scores = self.validation[0]["psnr"]
         most = 0.0
         chosen: float | None = math.inf
-        shares: list[tuple[float | None, NDArray[np.float64] | float]] = [
+        shares: list[tuple[float | None, Float | float]] = [
             *((k, views / (views + k)) for k in _PRIOR_VIEWS),
             *((None, share) for share in _BLENDS),
         ]
@@ -219,7 +216,7 @@ class Guard:
                 return part, value, share
         return self.start, self.before, 0.0
 
-    def arrays(self) -> dict[str, NDArray[Any]]:
+    def arrays(self) -> dict[str, Values]:
         """Return the best scene's arrays for a checkpoint; empty if it is the start."""
         if self.best is self.start:
             return {}

@@ -7,9 +7,9 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from g2ard.arrays import Mask
 from g2ard.errors import InputError
 from g2ard.progress import Progress, plural, silent
 from g2ard.rendering.exposure import Exposure
@@ -56,7 +56,7 @@ def recover(
     weights: ArrayLike | None = None,
     anchors: Anchors | None = None,
     validation: Targets | None = None,
-    frozen: NDArray[np.bool_] | None = None,
+    frozen: Mask | None = None,
     checkpoint: Path | None = None,
     progress: Progress = silent,
     stage: str = "recover",
@@ -106,7 +106,7 @@ def recover(
     validation = None if exact else validation
     others = None if validation is None else score_by_kind(validation, config.background)
 
-    def harmful(scene: Splats) -> NDArray[np.bool_] | None:
+    def harmful(scene: Splats) -> Mask | None:
         if validation is None:
             return None
         return find_harmful_changes(student, scene, validation, targets, config.background)

@@ -5,9 +5,9 @@ import time
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
 import g2ard._core as _core
+from g2ard.arrays import Float32, Mask
 from g2ard.rendering.exposure import rendered
 from g2ard.rendering.metrics import psnr
 from g2ard.rendering.renderer import Renderer, arrays_of, centred, settings_for, view_of
@@ -103,7 +103,7 @@ def find_harmful_changes(
     validation: Targets,
     training: Targets,
     background: tuple[float, float, float],
-) -> NDArray[np.bool_] | None:
+) -> Mask | None:
     """Find the Gaussians whose change made views worse; None if no validation view lost more than 1 dB.
 
     With E the change of the squared error in each pixel, relative to the view's mean before, Σ αT·E over the
@@ -141,7 +141,7 @@ class _Comparison:
         colours = np.zeros_like(sh0), np.zeros((len(scene), 0, 3), np.float32)
         self._grey = (means, quats, scales, logits, *colours)
 
-    def _errors(self, view: int) -> list[NDArray[np.float32]]:
+    def _errors(self, view: int) -> list[Float32]:
         camera = self._targets.cameras[view]
         target = self._targets[view]
         mask = mask_of(self._targets, view)
@@ -156,7 +156,7 @@ class _Comparison:
         before, after = (max(float(error.mean(dtype=np.float64)), _LEAST_MSE) for error in self._errors(view))
         return 10 * math.log10(after / before)
 
-    def light(self, view: int) -> NDArray[np.float32]:
+    def light(self, view: int) -> Float32:
         """Return a view's (N,) Σ αT·E, with E the change of the error relative to the mean before."""
         before, after = self._errors(view)
         image = np.zeros((*before.shape, 3), np.float32)
@@ -165,5 +165,5 @@ class _Comparison:
         seen = view_of(self._cameras, view, self._settings)
         rasterizer = _core.Rasterizer()
         rasterizer.forward(self._grey, seen, self._settings, [0.0, 0.0, 0.0], 0)
-        light: NDArray[np.float32] = rasterizer.backward(self._grey, image)[4][:, 0, 0]
+        light: Float32 = rasterizer.backward(self._grey, image)[4][:, 0, 0]
         return light  # the gradient of a colour is Σ αT·E

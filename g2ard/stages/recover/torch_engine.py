@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 import g2ard._core as _core
+from g2ard.arrays import Float32, Mask, Values
 from g2ard.scene.splats import Splats
 from g2ard.stages.recover.config import Rates
 from g2ard.stages.recover.engine import LEAST_LOSS, TYPICAL_LOSS, Objective, measure_radii
@@ -113,11 +113,11 @@ class TorchEngine:
     def step(
         self,
         view: int,
-        target: NDArray[np.float32],
+        target: Float32,
         rates: Rates,
         *,
         regularize: bool,
-        mask: NDArray[np.bool_] | None = None,
+        mask: Mask | None = None,
         fixed: bool = True,
     ) -> float:
         p = self._parameters
@@ -174,13 +174,13 @@ class TorchEngine:
             shN=p["shN"].numpy().copy(),
         )
 
-    def state(self) -> dict[str, NDArray[Any]]:
+    def state(self) -> dict[str, Values]:
         arrays = {f"p.{name}": value.detach().numpy() for name, value in self._parameters.items()}
         arrays["base"], arrays["unit"] = self._base.numpy(), self._unit.numpy()
         arrays["skipped"], arrays["counts"] = np.array(self._adam.skipped), self.counts
         return arrays | {name: moment.numpy() for name, moment in self._adam.moments.items()}
 
-    def load(self, state: dict[str, NDArray[Any]]) -> None:
+    def load(self, state: dict[str, Values]) -> None:
         with torch.no_grad():
             for name, parameter in self._parameters.items():
                 parameter.copy_(torch.from_numpy(state[f"p.{name}"]))
@@ -192,7 +192,7 @@ class TorchEngine:
             moment.copy_(torch.from_numpy(state[name]))
 
     @property
-    def counts(self) -> NDArray[Any]:
+    def counts(self) -> Values:
         return self._adam.counts.numpy()
 
     @property

@@ -14,16 +14,14 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 import g2ard._core as _core
+from g2ard.arrays import Float, Mask
 from g2ard.rendering.renderer import Rendered, Renderer
 from g2ard.scene.cameras import Camera
 from g2ard.stages.register.config import RegisterConfig
 from g2ard.stages.register.grey import blurred, gradient
-from g2ard.stages.register.pose import Float, moved
-
-Mask = NDArray[np.bool_]
+from g2ard.stages.register.pose import moved
 
 _TUKEY = 4.685
 """Tukey's constant, as in the normal equations' weights."""

@@ -4,8 +4,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from g2ard.arrays import Float, Float32, Mask
 from g2ard.io.images import resize
 from g2ard.io.photos import load_photo
 from g2ard.progress import Progress, silent
@@ -15,7 +15,7 @@ from g2ard.stages.register.align import Aligned, Level, align, inverse, level_of
 from g2ard.stages.register.config import RegisterConfig
 from g2ard.stages.register.grey import band_passed, grey_of, local_zncc, shift_between
 from g2ard.stages.register.matchers import Matcher, Sift, sift_or_none
-from g2ard.stages.register.pose import Float, motion_between, moved, pose_error, rotation_of
+from g2ard.stages.register.pose import motion_between, moved, pose_error, rotation_of
 from g2ard.stages.register.repeats import decisive, look, preference, repeated_poses, softened
 from g2ard.stages.register.solve import Solved, solve
 
@@ -100,8 +100,8 @@ class Photo:
     """
 
     camera: Camera
-    image: NDArray[np.float32]
-    mask: NDArray[np.bool_]
+    image: Float32
+    mask: Mask
     pyramid: list[tuple[Camera, Level]]
     small: tuple[Camera, Float]
     whole: Float
@@ -156,13 +156,13 @@ def loaded(cameras: Cameras, index: int, config: RegisterConfig, background: Seq
     return Photo(one[0], image, everywhere, pyramid, (camera, _take_grey(small)), _take_grey(finest))
 
 
-def _shrink(one: Cameras, planes: NDArray[np.float32], side: int) -> tuple[Camera, NDArray[np.float32]]:
+def _shrink(one: Cameras, planes: Float32, side: int) -> tuple[Camera, Float32]:
     """Shrink (H, W, 2) planes, grey and the valid share of each pixel, to a longer side."""
     camera = one.resized(side)[0]
     return camera, resize(planes, (camera.width, camera.height))
 
 
-def _take_grey(planes: NDArray[np.float32]) -> Float:
+def _take_grey(planes: Float32) -> Float:
     return planes[..., 0].astype(np.float64)
 
 

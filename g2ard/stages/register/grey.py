@@ -1,12 +1,9 @@
 """Grey images, their gradients and similarity measures."""
 
-from typing import Any
-
 import numpy as np
-from numpy.typing import NDArray
 
 import g2ard._core as _core
-from g2ard.stages.register.pose import Float
+from g2ard.arrays import Float, Mask, Values
 
 _LUMA = np.array([0.299, 0.587, 0.114])
 
@@ -14,7 +11,7 @@ _BAND_WINDOW = 9
 """Side in pixels of the window whose mean `band_passed` subtracts."""
 
 
-def grey_of(image: NDArray[Any]) -> Float:
+def grey_of(image: Values) -> Float:
     """Return the (H, W) float64 luma of an (H, W, 3) image, .299 R + .587 G + .114 B."""
     rgb = np.asarray(image, np.float64)
     return rgb[..., 0] * _LUMA[0] + rgb[..., 1] * _LUMA[1] + rgb[..., 2] * _LUMA[2]
@@ -47,7 +44,7 @@ def band_passed(image: Float) -> Float:
     return blurred(image) - box_mean(np.pad(image, _BAND_WINDOW // 2, mode="edge"), _BAND_WINDOW)
 
 
-def zncc(a: Float, b: Float, mask: NDArray[np.bool_]) -> float:
+def zncc(a: Float, b: Float, mask: Mask) -> float:
     """Return the zero-mean normalised cross-correlation of two (H, W) images over a mask, in [−1, 1].
 
     It is 0 if either image is flat or the mask is empty.
@@ -83,7 +80,7 @@ def shift_between(a: Float, b: Float) -> tuple[int, int, float]:
     return int(right[at[1]]), int(down[at[0]]), float(near[at] / scale)
 
 
-def local_zncc(a: Float, b: Float, mask: NDArray[np.bool_], side: int) -> float:
+def local_zncc(a: Float, b: Float, mask: Mask, side: int) -> float:
     """Return the median ZNCC of a grey render and photo, (H, W), over valid windows where the photo has
     contrast; 0 without one.
 

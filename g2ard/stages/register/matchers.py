@@ -14,15 +14,13 @@ from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from g2ard.arrays import Float, Float32, Int
 from g2ard.errors import InputError, MissingDependencyError
 from g2ard.stages.register.grey import grey_of
-from g2ard.stages.register.pose import Float
 
-Image = NDArray[np.float32]
 Pairs = tuple[Float, Float]
-Matcher = Callable[[Image, Image], Pairs]
+Matcher = Callable[[Float32, Float32], Pairs]
 
 _UPSAMPLED_SIDE = 500
 """Longer side in pixels up to which SIFT upsamples an image, because small images have few features."""
@@ -88,7 +86,7 @@ def _load_plugin(name: str) -> Matcher:
     if not callable(available):
         raise InputError(f"matcher {name}: {module} has no function {function}")
 
-    def match(photo: Image, render: Image) -> Pairs:
+    def match(photo: Float32, render: Float32) -> Pairs:
         try:
             pairs = available(photo, render)
         except (Exception, SystemExit) as error:
@@ -159,16 +157,16 @@ class Sift:
         for options.sift.first_octave in (-1, 0):
             self._extractors.append(pycolmap.FeatureExtractor.create(options, pycolmap.Device.cpu))
         self._ratio = ratio
-        self._kept: tuple[Image, tuple[Float, NDArray[np.float32]]] | None = None
+        self._kept: tuple[Float32, tuple[Float, Float32]] | None = None
 
-    def __call__(self, photo: Image, render: Image) -> Pairs:
+    def __call__(self, photo: Float32, render: Float32) -> Pairs:
         if self._kept is None or self._kept[0] is not photo:
             self._kept = photo, self.features(photo)
         (a, of_a), (b, of_b) = self._kept[1], self.features(render)
         i, j = mutual(of_a, of_b, self._ratio)
         return a[i], b[j]
 
-    def features(self, image: Image) -> tuple[Float, NDArray[np.float32]]:
+    def features(self, image: Float32) -> tuple[Float, Float32]:
         """Return (M, 2) positions and (M, 128) integer-valued descriptors."""
         grey = np.clip(grey_of(image) * 255 + 0.5, 0, 255).astype(np.uint8)
         doubled, whole = self._extractors
@@ -183,9 +181,7 @@ def sift_or_none(ratio: float, most: int) -> Sift | None:
     return None if _explain_unusable() else Sift(ratio, most)
 
 
-def mutual(
-    a: NDArray[np.float32], b: NDArray[np.float32], ratio: float
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def mutual(a: Float32, b: Float32, ratio: float) -> tuple[Int, Int]:
     """Return mutual nearest rows of `a` and `b` that are nearer than `ratio` times a's second nearest.
 
     Both are (…, D) integers whose dot products are below 2²⁴.

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from g2ard.arrays import Float
 from g2ard.config.choices import BLACK, Keep
 from g2ard.errors import InputError, require
 from g2ard.progress import Progress, silent
@@ -29,7 +30,7 @@ from g2ard.stages.register.attempts import (
 from g2ard.stages.register.config import TAIL, RegisterConfig
 from g2ard.stages.register.grey import band_passed
 from g2ard.stages.register.matchers import matcher_named
-from g2ard.stages.register.pose import Float, motion_between, pose_error
+from g2ard.stages.register.pose import motion_between, pose_error
 from g2ard.stages.register.report import KEPT, PhotoReport, PoseError, Registered, RegisterReport, Status
 
 _FEATURES_BONUS = 0.05

@@ -21,15 +21,15 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from g2ard.arrays import Float, Float32, Mask, Rows
 from g2ard.io.images import resize
 from g2ard.rendering.renderer import Rendered, Renderer
 from g2ard.scene.cameras import Camera
 from g2ard.stages.register.config import RegisterConfig
 from g2ard.stages.register.grey import band_passed, blurred, box_mean, grey_of, zncc
 from g2ard.stages.register.matchers import Sift
-from g2ard.stages.register.pose import Float, pose_error
+from g2ard.stages.register.pose import pose_error
 from g2ard.stages.register.solve import lifted, solve_pnp
 
 _MOST_PAIRS = 50_000
@@ -73,7 +73,7 @@ class Look(NamedTuple):
     """A render at the size of a photo: (H, W, 3) blurred colours, and the mask of opaque pixels."""
 
     image: Float
-    mask: NDArray[np.bool_]
+    mask: Mask
 
 
 def look(renderer: Renderer, camera: Camera, config: RegisterConfig) -> Look:
@@ -82,7 +82,7 @@ def look(renderer: Renderer, camera: Camera, config: RegisterConfig) -> Look:
     return Look(softened(np.clip(out.image, 0, 1)), out.alpha >= config.min_alpha)
 
 
-def softened(image: NDArray[np.float32]) -> Float:
+def softened(image: Float32) -> Float:
     """Blur each channel of an (H, W, 3) image."""
     return np.stack([blurred(image[..., c].astype(np.float64)) for c in range(3)], 2)
 
@@ -128,7 +128,7 @@ def repeated_poses(renderer: Renderer, camera: Camera, sift: Sift, config: Regis
     return found[:_MOST_REPEATS]
 
 
-def _find_common(steps: Float, least: int, most: int) -> Iterator[NDArray[np.intp]]:
+def _find_common(steps: Float, least: int, most: int) -> Iterator[Rows]:
     """Yield indices of the (M, D) displacements, in cells, around each of the `most` most common ones."""
     if len(steps) < least:
         return
@@ -187,7 +187,7 @@ class _Resemblance:
         return likeness * float(np.sqrt(share)) if likeness >= _SELF_LIKE[0] else 0.0
 
 
-def preference(photo: Float, mask: NDArray[np.bool_], a: Look, b: Look, config: RegisterConfig) -> float:
+def preference(photo: Float, mask: Mask, a: Look, b: Look, config: RegisterConfig) -> float:
     """Return (λ − ½)/σ: above `DECISIVE`, the photo excludes b, below its negative it excludes a.
 
     Where a render shows nothing, it predicts the photo's mean colour. Gain and bias of each channel are those

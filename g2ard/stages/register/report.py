@@ -6,9 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal
 
-import numpy as np
-from numpy.typing import NDArray
-
+from g2ard.arrays import Float
 from g2ard.config.choices import Keep
 from g2ard.io.reports import Report
 from g2ard.progress import plural
@@ -107,7 +105,7 @@ class Registered:
 
     cameras: Cameras
     report: RegisterReport
-    matches: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
+    matches: Mapping[str, Float] = field(default_factory=dict)
 
     def __repr__(self) -> str:
         return f"Registered({len(self.cameras)} of {plural(len(self.report.photos), 'photo')})"

@@ -9,14 +9,14 @@ the pose converges.
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from g2ard.arrays import Float, Float32, Mask
 from g2ard.rendering.renderer import Rendered, Renderer
 from g2ard.scene.cameras import Camera
 from g2ard.stages.register.align import focal_alone, focal_prior, zoomed
 from g2ard.stages.register.config import RegisterConfig
 from g2ard.stages.register.matchers import Matcher
-from g2ard.stages.register.pose import Float, moved
+from g2ard.stages.register.pose import moved
 
 _LEAST_MATCHES = 6
 """Least matches and inliers for a pose; three determine it, the rest confirm it."""
@@ -69,8 +69,8 @@ def solve(
     renderer: Renderer,
     start: Float,
     camera: Camera,
-    photo: NDArray[np.float32],
-    mask: NDArray[np.bool_],
+    photo: Float32,
+    mask: Mask,
     match: Matcher,
     config: RegisterConfig,
     passes: int,
@@ -123,15 +123,13 @@ def solve(
     return solution
 
 
-def _look_up(image: NDArray[np.bool_], uv: Float) -> NDArray[np.bool_]:
+def _look_up(image: Mask, uv: Float) -> Mask:
     height, width = image.shape
     column, row = np.floor(uv).astype(int).T
     return image[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)]
 
 
-def lifted(
-    out: Rendered, camera: Camera, uv: Float, config: RegisterConfig
-) -> tuple[Float, NDArray[np.bool_]]:
+def lifted(out: Rendered, camera: Camera, uv: Float, config: RegisterConfig) -> tuple[Float, Mask]:
     """Lift render pixels to 3D points.
 
     The median depth is interpolated between the four pixels around (u, v). It is known if all four have a
@@ -161,9 +159,7 @@ def lifted(
     return np.einsum("mi,ij->mj", seen - T[:3, 3], T[:3, :3], optimize=False), known
 
 
-def solve_pnp(
-    camera: Camera, uv: Float, points: Float, config: RegisterConfig
-) -> tuple[Float, NDArray[np.bool_]] | None:
+def solve_pnp(camera: Camera, uv: Float, points: Float, config: RegisterConfig) -> tuple[Float, Mask] | None:
     """Solve PnP for (M, 2) pixels of (M, 3) points; return pose and inlier mask, or None with too few."""
     import pycolmap
 

@@ -9,13 +9,14 @@ from typing import Literal
 import numpy as np
 
 import g2ard.stages.select.poses as poses
+from g2ard.arrays import Float, Int
 from g2ard.config.checks import checks_arguments
 from g2ard.config.choices import POLICIES
 from g2ard.errors import InputError, require
 from g2ard.progress import Progress, plural, silent
 from g2ard.scene.cameras import Cameras, unseeing
 from g2ard.scene.splats import Splats
-from g2ard.stages.select.surfaces import CoverageOptions, Float, Order, greedy
+from g2ard.stages.select.surfaces import CoverageOptions, greedy
 
 _LEAST_CURVE_BEND = 0.02
 """Height above its chord below which a curve counts as straight, so that no K stands out."""
@@ -41,12 +42,12 @@ class Selection:
     """
 
     policy: str
-    order: Order
+    order: Int
     gains: Float
     weights: Float
     left_out: float
     curve: Float
-    refused: Order
+    refused: Int
     evaluations: int = 0
     seconds: dict[str, float] = field(default_factory=dict)
 

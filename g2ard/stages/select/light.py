@@ -3,9 +3,9 @@
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
 import g2ard._core as _core
+from g2ard.arrays import Float, Float32, Int
 from g2ard.progress import Progress, silent
 from g2ard.rendering.renderer import arrays_of, centred, settings_for, view_of
 from g2ard.scene.cameras import Cameras
@@ -35,7 +35,7 @@ def complete(
     least_views: int = 1,
     represents: float = 1.0,
     progress: Progress = silent,
-) -> tuple[NDArray[np.int64], NDArray[np.float64], float]:
+) -> tuple[Int, Float, float]:
     """Choose offered views greedily by what they resolve beyond the given ones (decision 0034).
 
     The objective is F = Σ_i log(1 + Σ_v A_vi/16) over the given and the chosen views v, where A_vi is the
@@ -63,7 +63,7 @@ def complete(
     measured = take_evenly(given, _SAMPLED_VIEWS)
     renders = len(measured) + len(offered)
 
-    def light(cameras: Cameras, first: int) -> NDArray[np.float32]:
+    def light(cameras: Cameras, first: int) -> Float32:
         return _measure_light(
             scene, cameras, some, 1 / represents, lambda i: progress("coverage", first + i, renders)
         )
@@ -81,8 +81,8 @@ def complete(
 
 
 def _measure_light(
-    scene: Splats, cameras: Cameras, rows: NDArray[np.int64], share: float, tell: Callable[[int], None]
-) -> NDArray[np.float32]:
+    scene: Splats, cameras: Cameras, rows: Int, share: float, tell: Callable[[int], None]
+) -> Float32:
     """Return (C, R) min(share·A, 64)/16 for some rows."""
     local, here = centred(scene, cameras.resized(_RENDER_SIDE))
     settings = settings_for(local.means, None, antialiased=local.antialiased)

@@ -3,14 +3,14 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 import g2ard._core as _core
+from g2ard.arrays import Float, Int, Mask
 from g2ard.errors import InputError
 from g2ard.progress import Progress, counter, silent
 from g2ard.scene.cameras import Cameras, unseeing
 from g2ard.scene.splats import Splats
-from g2ard.stages.select.surfaces import Float, Order, Surface, core_scene, core_views, surface
+from g2ard.stages.select.surfaces import Surface, core_scene, core_views, surface
 
 _KERNEL_BANDWIDTH = 0.35
 """Bandwidth of the kernel exp(−(d/0.35)²): neighbours 20° apart on an orbit have similarity ½."""
@@ -46,7 +46,7 @@ class Candidates:
     alike: Float
     weights: Float
     shares: Float
-    usable: NDArray[np.bool_]
+    usable: Mask
 
 
 def measure_candidates(splats: Splats, cameras: Cameras, progress: Progress = silent) -> Candidates:
@@ -97,7 +97,7 @@ def outlooks(cells: Surface, cameras: Cameras) -> tuple[Float, Float]:
     return depths, shares
 
 
-def inside_geometry(splats: Splats, cameras: Cameras, depths: Float, progress: Progress) -> NDArray[np.bool_]:
+def inside_geometry(splats: Splats, cameras: Cameras, depths: Float, progress: Progress) -> Mask:
     """Return a (C,) mask of poses inside geometry; poses of photos are never marked.
 
     `depths` comes from `outlooks`.
@@ -112,7 +112,7 @@ def inside_geometry(splats: Splats, cameras: Cameras, depths: Float, progress: P
     small = core_views(cameras.resized(_INSIDE_RENDER_SIDE), origin, scene)
     share, near = _core.select_view_statistics(scene, small, progress=counter(progress, "poses")).T
     typical = np.median(np.where(near > 0, near, depths)[depths > 0])
-    inside: NDArray[np.bool_] = made & (share > 0.5) & (near < _INSIDE_DEPTH_SHARE * typical)
+    inside: Mask = made & (share > 0.5) & (near < _INSIDE_DEPTH_SHARE * typical)
     return inside
 
 
@@ -141,8 +141,8 @@ def inverse_density(alike: Float) -> Float:
     return weights / weights.sum()
 
 
-def facility_location(alike: Float, pose_weights: Float, usable: NDArray[np.bool_], shares: Float) -> Order:
-    """Order views by how well they represent all candidates: reach first, then facility location.
+def facility_location(alike: Float, pose_weights: Float, usable: Mask, shares: Float) -> Int:
+    """Int views by how well they represent all candidates: reach first, then facility location.
 
     From the weighted medoid, the farthest pose comes next while any pose is more than two bandwidths from all
     chosen ones, where the kernel is flat. Greedy facility location follows. A view's gain is multiplied by
@@ -180,7 +180,7 @@ def bandwidths_apart(alike: Float) -> Float:
     return np.asarray(np.sqrt(-np.log(np.maximum(alike, np.finfo(np.float64).tiny))))
 
 
-def gains_of(order: Order, alike: Float, pose_weights: Float) -> Float:
+def gains_of(order: Int, alike: Float, pose_weights: Float) -> Float:
     """Return the gain of each view of an order in facility location, Σ_u w_u max_{v∈S} alike_uv."""
     best = np.zeros(len(alike))
     gains = []
@@ -190,7 +190,7 @@ def gains_of(order: Order, alike: Float, pose_weights: Float) -> Float:
     return np.array(gains)
 
 
-def draw_weights(order: Order, alike: Float, pose_weights: Float) -> Float:
+def draw_weights(order: Int, alike: Float, pose_weights: Float) -> Float:
     """Return (K,) summed weights of the poses nearest to each chosen view, with mean 1."""
     nearest = order[np.argmax(alike[:, order], axis=1)]
     nearest[order] = order  # each is its own nearest, even among equal poses

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import g2ard._core as _core
+from g2ard.arrays import Float, Int
 from g2ard.config.checks import AtLeastOne, NotNegative, Positive, Within
 from g2ard.config.schema import Settings
 from g2ard.errors import InputError, require
@@ -17,9 +18,6 @@ from g2ard.progress import Progress, counter, silent
 from g2ard.rendering.renderer import View, settings_for, view_of
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats, check_finite, unit_quats
-
-Float = NDArray[np.float64]
-Order = NDArray[np.int64]
 
 _CORE = _core.defaults()["coverage"]
 
@@ -135,7 +133,7 @@ def greedy(
     options: CoverageOptions | None,
     progress: Progress,
     seconds: dict[str, float],
-) -> tuple[Order, Float, int]:
+) -> tuple[Int, Float, int]:
     """Return the views that see a cell in greedy order, their gains, and the number of evaluations."""
     options = options or CoverageOptions()
     began = time.perf_counter()

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 import numpy as np
-from numpy.typing import NDArray
 
+from g2ard.arrays import Float32
 from g2ard.progress import Say
 from g2ard.rendering.renderer import Renderer, settings_for
 from g2ard.scene.cameras import Camera, Cameras
@@ -55,7 +55,7 @@ def light_lost(dense: Splats, result: Splats, views: Iterable[Camera]) -> tuple[
     return through, opaque
 
 
-def let_through(stopped: NDArray[np.float32], now: NDArray[np.float32]) -> tuple[float, float]:
+def let_through(stopped: Float32, now: Float32) -> tuple[float, float]:
     """Return what `light_lost` sums, of one view.
 
     Args:

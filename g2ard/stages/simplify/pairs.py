@@ -6,9 +6,9 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 import g2ard._core as _core
+from g2ard.arrays import Float32, Mask, Values
 from g2ard.errors import InputError
 from g2ard.progress import Progress, counter
 from g2ard.rendering.recolour import recoloured
@@ -40,9 +40,7 @@ VisibilitySource = Callable[[Splats], SampledVisibility]
 """Function scene → visibility, such as `g2ard.rendering.visibility.visibility_source` returns."""
 
 
-def rows_of(
-    visibility: SampledVisibility, count: int, finite: NDArray[np.bool_] | slice
-) -> SampledVisibility:
+def rows_of(visibility: SampledVisibility, count: int, finite: Mask | slice) -> SampledVisibility:
     for name in ("weight", "pixel_size"):
         shape = getattr(visibility, name).shape
         if shape != (count,):
@@ -68,7 +66,7 @@ def merge(
     scene: PreparedScene,
     budget: int,
     visibility: SampledVisibility | None,
-    protected: NDArray[np.bool_] | None,
+    protected: Mask | None,
     config: Pairs,
     progress: Progress,
 ) -> dict[str, Any]:
@@ -89,7 +87,7 @@ def merge_and_fit(
     scene: PreparedScene,
     budget: int,
     source: VisibilitySource,
-    protected: NDArray[np.bool_] | None,
+    protected: Mask | None,
     config: Pairs,
     progress: Progress,
 ) -> dict[str, Any]:
@@ -123,9 +121,7 @@ def merge_and_fit(
     }
 
 
-def fit_opacities(
-    scene: Splats, members: NDArray[Any], wanted: NDArray[Any], now: NDArray[Any], mean: float
-) -> Splats:
+def fit_opacities(scene: Splats, members: Values, wanted: Values, now: Values, mean: float) -> Splats:
     """Fit opacities so that views see about as much of each row as of its members.
 
     α is multiplied by ratio^¼, with the ratio limited to 0.5–2, because neighbours share a deficit and other
@@ -162,7 +158,7 @@ def fit_opacities(
 
 
 def splats_of(like: Splats, out: dict[str, Any]) -> Splats:
-    sh: NDArray[np.float32] = out["sh"]
+    sh: Float32 = out["sh"]
     return Splats(
         out["means"].astype(like.means.dtype, copy=False),
         out["quats"],

@@ -7,9 +7,9 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 import g2ard._core as _core
+from g2ard.arrays import Int, Mask
 from g2ard.errors import InputError, require
 from g2ard.io.reports import LEFT_OUT, Report
 from g2ard.progress import Progress, counter, plural, silent
@@ -108,8 +108,8 @@ class Simplified(Shown):
     """
 
     splats: Splats
-    parents: NDArray[np.int64]
-    protected: NDArray[np.bool_]
+    parents: Int
+    protected: Mask
     report: SimplifyReport
 
     def __repr__(self) -> str:
@@ -122,7 +122,7 @@ def simplify(
     *,
     method: str | None = None,
     visibility: SampledVisibility | VisibilitySource | None = None,
-    protected: NDArray[np.bool_] | None = None,
+    protected: Mask | None = None,
     final_budget: int | None = None,
     gaps: bool = False,
     config: SimplifyConfig = _DEFAULTS,
@@ -210,16 +210,14 @@ def simplify(
     return _finish(splats, finite, out, lost)
 
 
-def _finish(
-    splats: Splats, finite: NDArray[np.bool_] | slice, out: dict[str, Any], lost: float | None
-) -> Simplified:
+def _finish(splats: Splats, finite: Mask | slice, out: dict[str, Any], lost: float | None) -> Simplified:
     parents = np.full(len(splats), -1, np.int64)
     parents[finite] = out["parents"]
     small = splats_of(splats, out).with_sh_degree(splats.sh_degree)
     small = replace(small, quats=unit_quats(small.quats))  # unmerged rows keep their quaternions
     kept = int(np.count_nonzero(parents >= 0))
     alone = int(np.count_nonzero(np.bincount(parents[parents >= 0], minlength=len(small)) == 1))
-    protected: NDArray[np.bool_] = out["protected"]
+    protected: Mask = out["protected"]
     report = SimplifyReport(
         input_count=len(splats),
         output_count=len(small),
@@ -242,7 +240,7 @@ def _finish(
     return Simplified(small, parents, protected, report)
 
 
-def _count_faded(splats: Splats, small: Splats, parents: NDArray[np.int64]) -> int:
+def _count_faded(splats: Splats, small: Splats, parents: Int) -> int:
     """Count merged rows too faint to draw although a member was drawn: distant floaters whose mass is spread
     too thin."""
     faint = small.logit_opacities < DRAWN_LOGIT
