@@ -3,12 +3,12 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from g2ard.arrays import Int
 from g2ard.config import choices
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats
 from g2ard.stages.select import CoverageOptions, select, surface, visible_cells
 from g2ard.stages.select.poses import Candidates, bandwidths_apart, measure_candidates
-from g2ard.stages.select.surfaces import Order
 
 __all__ = ["POLICIES", "order_views"]
 
@@ -18,7 +18,7 @@ POLICIES = ("random", "pose-diverse", "coverage", *choices.POLICIES)
 
 def order_views(
     splats: Splats, cameras: Cameras, policy: str, *, seed: int = 0, options: CoverageOptions | None = None
-) -> Order:
+) -> Int:
     """Return the views that a policy may choose, best first.
 
     Args:
@@ -37,7 +37,7 @@ def order_views(
     return usable[_covering(splats, cameras.take(usable), options or CoverageOptions())]
 
 
-def _farthest(candidates: Candidates) -> Order:
+def _farthest(candidates: Candidates) -> Int:
     """Order by farthest pose, starting at the most central."""
     usable = candidates.usable
     away = bandwidths_apart(candidates.alike)
@@ -52,7 +52,7 @@ def _farthest(candidates: Candidates) -> Order:
     return np.array(order, np.int64)
 
 
-def _covering(splats: Splats, cameras: Cameras, options: CoverageOptions) -> Order:
+def _covering(splats: Splats, cameras: Cameras, options: CoverageOptions) -> Int:
     """Return the views that see a cell, in greedy order of the fair utilities of the cells that they see."""
     cells = surface(splats, options.cells)
     starts, seen = visible_cells(splats, cells, cameras, depth_tolerance=options.depth_tolerance)

@@ -142,7 +142,7 @@ def inverse_density(alike: Float) -> Float:
 
 
 def facility_location(alike: Float, pose_weights: Float, usable: Mask, shares: Float) -> Int:
-    """Int views by how well they represent all candidates: reach first, then facility location.
+    """Order views by how well they represent all candidates: reach first, then facility location.
 
     From the weighted medoid, the farthest pose comes next while any pose is more than two bandwidths from all
     chosen ones, where the kernel is flat. Greedy facility location follows. A view's gain is multiplied by
