@@ -13,17 +13,15 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 import g2ard._core as _core
+from g2ard.arrays import Float, Float32, Mask
 from g2ard.config.choices import BLACK
 from g2ard.errors import require
 from g2ard.rendering.renderer import RasterSettings, Renderer, corners_of, view_of
 from g2ard.scene.cameras import Camera, Cameras
 from g2ard.scene.kdtree import KdTree
 from g2ard.scene.splats import Splats
-
-_Floats = NDArray[np.float32]
 
 FAINT = 1 / 255
 """Light in front of a box below which it adds less than a step of an 8-bit image."""
@@ -44,8 +42,8 @@ class Canvas:
     """
 
     camera: Camera
-    color: _Floats
-    light: _Floats
+    color: Float32
+    light: Float32
 
     @classmethod
     def blank(cls, camera: Camera) -> Canvas:
@@ -53,7 +51,7 @@ class Canvas:
         size = camera.height, camera.width
         return cls(camera, np.zeros((*size, 3), np.float32), np.ones(size, np.float32))
 
-    def draw(self, renderer: Renderer, box: NDArray[np.float64]) -> None:
+    def draw(self, renderer: Renderer, box: Float) -> None:
         """Draw a box of a scene behind what is drawn.
 
         Args:
@@ -63,7 +61,7 @@ class Canvas:
         """
         renderer.draw(self.camera, box, self.color, self.light)
 
-    def light_on(self, box: NDArray[np.float64]) -> float:
+    def light_on(self, box: Float) -> float:
         """Return the most light left in pixels whose rays meet a box, without those that have stopped.
 
         A box with 0 adds nothing. Boxes with less than `FAINT` add less than that to any pixel, all together.
@@ -71,13 +69,13 @@ class Canvas:
         view = view_of(Cameras.of([self.camera]), 0, _ANY_DEPTH)
         return _core.light_on(self.light, view, _ANY_DEPTH, corners_of(box))
 
-    def finished(self, background: Sequence[float] = BLACK) -> _Floats:
+    def finished(self, background: Sequence[float] = BLACK) -> Float32:
         """Return the (H, W, 4) image in front of a background, RGB in [0, 1], and its alpha."""
         left = np.abs(self.light)[..., None]
         return np.dstack([self.color + left * np.asarray(background, np.float32), 1 - left])
 
 
-def front_to_back(tree: KdTree, position: NDArray[np.float64]) -> list[int]:
+def front_to_back(tree: KdTree, position: Float) -> list[int]:
     """Return the leaves of a tree, by number, in the order in which rays from a position pass them.
 
     >>> front_to_back(KdTree(0, 1.0, KdTree(), KdTree()), np.array([3.0, 0, 0]))
@@ -86,7 +84,7 @@ def front_to_back(tree: KdTree, position: NDArray[np.float64]) -> list[int]:
     return list(_walk(tree, position, 0))
 
 
-def _walk(tree: KdTree, position: NDArray[np.float64], first: int) -> Iterator[int]:
+def _walk(tree: KdTree, position: Float, first: int) -> Iterator[int]:
     if not (tree.below and tree.above):
         yield first
         return
@@ -97,7 +95,7 @@ def _walk(tree: KdTree, position: NDArray[np.float64], first: int) -> Iterator[i
         yield from _walk(half, position, number)
 
 
-def reaching(splats: Splats, cameras: Cameras, box: NDArray[np.float64]) -> NDArray[np.bool_]:
+def reaching(splats: Splats, cameras: Cameras, box: Float) -> Mask:
     """Return (N,) which Gaussians may have a pixel in a box, at α ≥ 1/255, in some view: all that it needs.
 
     Args:

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from g2ard.arrays import Float, Float32, Mask
 from g2ard.io.reports import Report
 from g2ard.rendering.renderer import Renderer
 from g2ard.rendering.targets import Exposed, Targets, against_of, alpha_of, mask_of
@@ -29,7 +29,6 @@ explain as much of a small error, but with little more than half of these stops.
 _COMPARED_VIEWS = 64
 """Most photos compared for that."""
 
-Float = NDArray[np.float64]
 Background = Sequence[float]
 
 
@@ -91,16 +90,14 @@ class Moments:
         return float((self.total - 2 * (change * self.right).sum(1) + squares).sum())
 
 
-def _find_backdrop(alpha: NDArray[np.float32] | None, background: Background) -> NDArray[np.float32] | float:
+def _find_backdrop(alpha: Float32 | None, background: Background) -> Float32 | float:
     """Return what of an image is background behind a photo with alpha."""
     if alpha is None:
         return 0.0
     return (1 - alpha[..., None]) * np.asarray(background, np.float32)
 
 
-def _compare_moments(
-    image: NDArray[np.float32], targets: Targets, view: int, background: Background
-) -> Moments:
+def _compare_moments(image: Float32, targets: Targets, view: int, background: Background) -> Moments:
     """Compare a render, not clipped, with a photo where neither too bright nor too dark to tell."""
     photo = targets[view]
     alpha = alpha_of(targets, view)
@@ -122,7 +119,7 @@ def _compare_moments(
     return Moments(normal, right, total(missing**2), int(counts.sum(dtype=np.int64)) // 3)
 
 
-def rendered(renderer: Renderer, targets: Targets, view: int) -> NDArray[np.float32]:
+def rendered(renderer: Renderer, targets: Targets, view: int) -> Float32:
     """Render a view of targets, clipped to [0, 1]; with `Exposed` targets, after the gain and offset of each
     channel that fit it best to its photo."""
     if not isinstance(targets, Exposed) or against_of(targets, view) != "photo":
@@ -138,7 +135,7 @@ def rendered(renderer: Renderer, targets: Targets, view: int) -> NDArray[np.floa
 
 def unexposed(
     targets: Targets, view: int, exposure: Float, background: Background
-) -> tuple[NDArray[np.float32], NDArray[np.bool_] | None]:
+) -> tuple[Float32, Mask | None]:
     """Return a photo as the mean exposure would have made it, and its mask.
 
     Pixels that a brighter exposure saturated do not count.

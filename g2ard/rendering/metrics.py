@@ -8,12 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 import g2ard._core as _core
+from g2ard.arrays import Float32, Mask
 from g2ard.errors import InputError, require_torch
 
 _Image = NDArray[np.floating[Any]]
 
 
-def psnr(image: _Image, target: _Image, mask: NDArray[np.bool_] | None = None) -> float:
+def psnr(image: _Image, target: _Image, mask: Mask | None = None) -> float:
     """Return the PSNR, −10·log₁₀ MSE for a peak of 1, at most 100 dB (identical images); NaN for NaN pixels.
 
     Args:
@@ -33,7 +34,7 @@ def psnr(image: _Image, target: _Image, mask: NDArray[np.bool_] | None = None) -
     return float(np.minimum(100.0, _core.psnr(_as_float32(image), _as_float32(target))))
 
 
-def edge_psnr(image: _Image, target: _Image, mask: NDArray[np.bool_] | None = None) -> float:
+def edge_psnr(image: _Image, target: _Image, mask: Mask | None = None) -> float:
     """Return the PSNR of the images' gradients: how well edges, wires and text are kept.
 
     It is −10·log₁₀ of the mean squared error of the differences between neighbouring pixels, along rows and
@@ -52,7 +53,7 @@ def edge_psnr(image: _Image, target: _Image, mask: NDArray[np.bool_] | None = No
     return float(np.minimum(100.0, -10 * np.log10(error / count)))
 
 
-def detail(image: _Image, target: _Image, mask: NDArray[np.bool_] | None = None) -> float:
+def detail(image: _Image, target: _Image, mask: Mask | None = None) -> float:
     """Return how much of the target's detail an image has: the correlation of their gradients.
 
     Gradients are the differences g between neighbouring pixels, as in `edge_psnr`. The result is
@@ -77,7 +78,7 @@ _INVISIBLE = 1e-4
 """Difference between neighbouring pixels that nobody sees: a fortieth of a step of 8 bits."""
 
 
-def lost_detail(image: _Image, target: _Image, mask: NDArray[np.bool_] | None = None) -> float:
+def lost_detail(image: _Image, target: _Image, mask: Mask | None = None) -> float:
     """Return how visible the detail is that an image lacks in its worst regions; 1 is just noticeable.
 
     Detail is local contrast: luminance minus its mean over 9 pixels, divided by that mean (Weber). In regions
@@ -108,7 +109,7 @@ _MASKING = 0.7
 """Exponent of its growth over a contrast that is seen."""
 
 
-def ssim(image: _Image, target: _Image, mask: NDArray[np.bool_] | None = None) -> float:
+def ssim(image: _Image, target: _Image, mask: Mask | None = None) -> float:
     """Return the mean structural similarity: 11×11 Gaussian window, σ 1.5, values in 0–1, as INRIA's.
 
     Without a mask, pixels beyond the image's edge are black. With one, they have no part, like all pixels
@@ -127,11 +128,11 @@ def ssim(image: _Image, target: _Image, mask: NDArray[np.bool_] | None = None) -
     return _core.ssim(_as_float32(image), _as_float32(target), _counts(mask))
 
 
-def _as_float32(image: _Image) -> NDArray[np.float32]:
+def _as_float32(image: _Image) -> Float32:
     return np.ascontiguousarray(image, dtype=np.float32)
 
 
-def _counts(mask: NDArray[np.bool_] | None) -> NDArray[np.bool_] | None:
+def _counts(mask: Mask | None) -> Mask | None:
     return None if mask is None else np.ascontiguousarray(mask)
 
 
@@ -145,7 +146,7 @@ class Metric(NamedTuple):
         legend: line under tables, where the heading is not enough.
     """
 
-    measure: Callable[[_Image, _Image, NDArray[np.bool_] | None], float]
+    measure: Callable[[_Image, _Image, Mask | None], float]
     heading: str
     digits: int
     legend: str = ""
@@ -211,7 +212,7 @@ class Lpips:
         except KeyError as error:
             raise InputError(f"LPIPS {net}: the weights lack {error}") from None
 
-    def __call__(self, image: NDArray[np.float32], target: NDArray[np.float32]) -> float:
+    def __call__(self, image: Float32, target: Float32) -> float:
         """Return the distance of two (H, W, 3) images in [0, 1]."""
         import torch
 
@@ -222,7 +223,7 @@ class Lpips:
                 total += float((difference * weight).sum(1).mean())
         return total
 
-    def _maps(self, image: NDArray[np.float32]) -> list[Any]:
+    def _maps(self, image: Float32) -> list[Any]:
         import torch
         from torch.nn import functional
 

@@ -7,9 +7,9 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 import g2ard._core as _core
+from g2ard.arrays import Float, Float32
 from g2ard.progress import Progress, silent
 from g2ard.rendering.renderer import RasterSettings, View, arrays_of, centred, settings_for, view_of
 from g2ard.scene.cameras import Cameras
@@ -24,8 +24,6 @@ _FLOOR = 0.05
 """Share of the mean weight added to every Gaussian's, so that colours hardly seen stay unchanged."""
 
 _DARKNESS = (0.0, 0.0, 0.0)
-
-_Image = NDArray[np.float32]
 
 
 def recoloured(dense: Splats, small: Splats, views: Cameras, progress: Progress = silent) -> Splats:
@@ -45,7 +43,7 @@ def recoloured(dense: Splats, small: Splats, views: Cameras, progress: Progress 
     dense, cameras = centred(dense, chosen)
     arrays = arrays_of(dense)
 
-    def shown(view: int) -> tuple[_Image, _Image]:
+    def shown(view: int) -> tuple[Float32, Float32]:
         image, alpha, *_ = _draw(_core.Rasterizer(), arrays, view_of(cameras, view, settings), settings)
         return image, alpha
 
@@ -60,7 +58,7 @@ def seen_by(views: Cameras) -> Cameras:
 def shifted(
     small: Splats,
     views: Cameras,
-    shown: Callable[[int], tuple[_Image, _Image]],
+    shown: Callable[[int], tuple[Float32, Float32]],
     settings: RasterSettings,
     progress: Progress = silent,
 ) -> Splats:
@@ -74,7 +72,7 @@ def shifted(
     drawable, cameras = centred(small, views)
     arrays = arrays_of(drawable)
 
-    def sums(view: int) -> NDArray[np.float64]:
+    def sums(view: int) -> Float:
         image, alpha = shown(view)
         rasterizer, camera = _core.Rasterizer(), view_of(cameras, view, settings)
         own_image, opacity, *_ = _draw(rasterizer, arrays, camera, settings)

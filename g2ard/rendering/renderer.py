@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
-from numpy.typing import NDArray
 
 import g2ard._core as _core
+from g2ard.arrays import Bytes, Float, Float32, Values
 from g2ard.config.checks import AboveZero, Within, checks_arguments
 from g2ard.config.choices import BLACK, Convention
 from g2ard.config.schema import Settings
@@ -22,7 +22,6 @@ from g2ard.scene.lenses import FACES, panorama_rays, photo_of
 from g2ard.scene.prepared import DRAWN_LOG_SCALES, DRAWN_LOGITS, MAX_OPACITY
 from g2ard.scene.splats import HasSplats, Splats, scene_of, unit_quats
 
-_Floats = NDArray[np.float32]
 Corners = tuple[list[float], list[float]]
 View = tuple[list[list[float]], list[float], tuple[int, int], float]
 
@@ -62,7 +61,7 @@ class RasterSettings(Settings):
 
 
 def settings_for(
-    means: NDArray[Any], settings: RasterSettings | None = None, *, antialiased: bool = False
+    means: Values, settings: RasterSettings | None = None, *, antialiased: bool = False
 ) -> RasterSettings:
     """Fill in what settings leave to the scene: its render model, and a near plane for its unit.
 
@@ -100,13 +99,13 @@ def view_of(cameras: Cameras, index: int, settings: RasterSettings) -> View:
     )
 
 
-def corners_of(box: NDArray[np.float64]) -> Corners:
+def corners_of(box: Float) -> Corners:
     """Convert a (2, 3) box to the form that `_core` takes."""
     low, high = np.asarray(box, np.float64).tolist()
     return low, high
 
 
-def arrays_of(splats: Splats) -> tuple[_Floats, _Floats, _Floats, _Floats, _Floats, _Floats]:
+def arrays_of(splats: Splats) -> tuple[Float32, Float32, Float32, Float32, Float32, Float32]:
     """Return the six float32 arrays that `_core` takes, in stored form.
 
     Logits and log-scales are clamped to what float32 can represent: a byte opacity of 255 decodes to +∞.
@@ -139,16 +138,16 @@ class Rendered:
             0 if there is none; None unless requested.
     """
 
-    image: _Floats
-    alpha: _Floats
-    depth: _Floats
-    median: _Floats | None = None
+    image: Float32
+    alpha: Float32
+    depth: Float32
+    median: Float32 | None = None
 
     def __repr__(self) -> str:
         height, width = self.alpha.shape
         return f"Rendered({width} × {height})"
 
-    def image_8bit(self) -> NDArray[np.uint8]:
+    def image_8bit(self) -> Bytes:
         """Return the image as bytes, (H, W, 3) uint8, clipped and rounded like `g2ard render` does."""
         return to_bytes(self.image)
 
@@ -193,7 +192,7 @@ class Renderer:
         self._bounds = _core.RowBounds(self._arrays)
         self._rasterizer = _core.Rasterizer()
 
-    def image(self, camera: Camera) -> _Floats:
+    def image(self, camera: Camera) -> Float32:
         """Render the (H, W, 3) image only, see `Rendered.image`; faster than `render`, and by gsplat's
         convention on the device in use (`system.devices`).
 
@@ -203,7 +202,7 @@ class Renderer:
         view = self._view(camera)
         return self._rasterizer.image(self._arrays, view, self._settings, self.background, self._bounds)
 
-    def clipped(self, camera: Camera) -> _Floats:
+    def clipped(self, camera: Camera) -> Float32:
         """Return `image` clipped to [0, 1], as photos are."""
         image = self.image(camera)
         return np.clip(image, 0, 1, out=image)
@@ -229,9 +228,9 @@ class Renderer:
     def draw(
         self,
         camera: Camera,
-        box: NDArray[np.float64],
-        color: _Floats,
-        light: _Floats,
+        box: Float,
+        color: Float32,
+        light: Float32,
     ) -> None:
         """Draw a box of the scene on the planes of a `rendering.boxes.Canvas`, in place."""
         corners = corners_of(box - self._offset)
@@ -264,7 +263,7 @@ class Renderer:
 
         require("width", width, width % 2 == 0, "an even number of pixels")
 
-        def shown(view: Camera) -> tuple[_Floats, _Floats, _Floats]:
+        def shown(view: Camera) -> tuple[Float32, Float32, Float32]:
             rendered = self.render(view)
             return rendered.image, rendered.alpha, rendered.depth
 
@@ -343,8 +342,8 @@ def stations(cameras: Cameras) -> Cameras:
 
 
 def panorama(
-    shown: Callable[[Camera], tuple[_Floats, _Floats, _Floats]], camera: Camera, width: int
-) -> tuple[_Floats, _Floats, _Floats]:
+    shown: Callable[[Camera], tuple[Float32, Float32, Float32]], camera: Camera, width: int
+) -> tuple[Float32, Float32, Float32]:
     """Render all directions around a camera.
 
     Args:
@@ -384,9 +383,7 @@ def panorama(
     return np.ascontiguousarray(out[..., :3]), out[..., 3].copy(), out[..., 4].copy()
 
 
-def _sample(
-    picture: _Floats, side: int, u: NDArray[np.float64], v: NDArray[np.float64]
-) -> NDArray[np.float32]:
+def _sample(picture: Float32, side: int, u: Float, v: Float) -> Float32:
     """Sample a square picture, (side², C), bilinearly at pixels u, v."""
     left = np.floor(u - 0.5).astype(int)
     above = np.floor(v - 0.5).astype(int)

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from g2ard.arrays import Float32
 from g2ard.rendering.renderer import Rendered
 
 TOP = (0x7D, 0x93, 0xA8)
@@ -14,7 +14,7 @@ BOTTOM = (0xC6, 0xCE, 0xD2)
 """Colour of the sky at the lower edge."""
 
 
-def over_sky(image: NDArray[np.float32], light: NDArray[np.float32]) -> NDArray[np.float32]:
+def over_sky(image: Float32, light: Float32) -> Float32:
     """Return an image on black in front of the sky.
 
     Args:
@@ -29,6 +29,6 @@ def over_sky(image: NDArray[np.float32], light: NDArray[np.float32]) -> NDArray[
     return np.asarray(image + light[..., None] * (top + down * (bottom - top)), np.float32)
 
 
-def seen_on_sky(drawn: Rendered) -> NDArray[np.float32]:
+def seen_on_sky(drawn: Rendered) -> Float32:
     """Return the image of a view on black in front of the sky, (H, W, 3), clipped to [0, 1]."""
     return np.clip(over_sky(drawn.image, 1 - drawn.alpha), 0, 1)

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import g2ard._core as _core
+from g2ard.arrays import Float, Float32, Values
 from g2ard.progress import Progress, counter, silent
 from g2ard.rendering.renderer import RasterSettings, arrays_of, centred, settings_for, view_of
 from g2ard.scene.cameras import USUAL, Cameras, rows_by_kind
@@ -43,8 +44,6 @@ Measured in decision 0040."""
 CONVERGED = 0.01
 """Sampling stops after a round whose share of newly seen Gaussians is below this."""
 
-_Floats = NDArray[np.float32]
-
 
 @dataclass(frozen=True, eq=False)
 class SampledVisibility:
@@ -57,8 +56,8 @@ class SampledVisibility:
             the full-size image.
     """
 
-    weight: NDArray[Any]
-    pixel_size: _Floats
+    weight: Values
+    pixel_size: Float32
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,10 +72,10 @@ class Visibility(SampledVisibility):
         peak: (N,) float32, its largest αT.
     """
 
-    transmittance: NDArray[np.float64]
+    transmittance: Float
     hits: NDArray[np.uint64]
     dominant: NDArray[np.uint64]
-    peak: _Floats
+    peak: Float32
 
 
 def visibility(
