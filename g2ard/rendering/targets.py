@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -25,12 +25,13 @@ from g2ard.scene.splats import Splats
 from g2ard.system.cached import cached_property
 from g2ard.system.keys import key_of
 from g2ard.system.shown import Shown
+from g2ard.system.spill import Spill
 from g2ard.system.threads import in_threads
 
 RENDERS = "the dense scene"
 """Name of targets that are not photos."""
 CACHE_BYTES = 2_000_000_000
-"""Bytes of targets cached in memory; further ones are loaded or rendered again on each access."""
+"""Bytes of targets kept in memory; further ones are in a temporary file, see `Spill`."""
 
 
 class Targets(Protocol):
@@ -301,14 +302,21 @@ _KEEPING = threading.Lock()
 
 
 class Cached(_Sourced, Shown):
-    """Cache of what `_make` returns, up to `limit` bytes, first come first kept."""
+    """Cache of what `_make` returns: up to `limit` bytes in memory, first come first kept, others on disk.
+
+    Without room on the disk, they are made again on each access.
+    """
+
+    _spills: ClassVar[bool] = True
+    """Whether images beyond the limit are written to a temporary file."""
 
     def __init__(self, cameras: Cameras, limit: int) -> None:
         require("limit", limit, limit >= 0, "at least 0 bytes")
         self.cameras = cameras
         self._limit = limit
-        self._kept: dict[int, NDArray[Any] | None] = {}
+        self._kept: dict[tuple[str, int], NDArray[Any] | None] = {}
         self._bytes = 0
+        self._spill = Spill()
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}({plural(len(self.cameras), 'view')})"
@@ -321,20 +329,29 @@ class Cached(_Sourced, Shown):
         """Make images before they are drawn, if that takes long; see `fill`."""
 
     def _stored(self, view: int) -> NDArray[Any]:
-        return self._cached(self._kept, view, self._make)
+        return self._cached("image", view, self._make)
 
-    def _cached(self, kept: dict[int, Any], view: int, make: Callable[[int], Any]) -> Any:
-        """Return what `kept` holds of a view, or make it, and keep it within the limit."""
-        if view in kept:
-            return kept[view]
+    def _holds(self, view: int) -> bool:
+        return ("image", view) in self._kept or ("image", view) in self._spill
+
+    def _cached(self, kind: str, view: int, make: Callable[[int], Any]) -> Any:
+        """Return an array of a view, or None, which is made if neither memory nor disk holds it."""
+        key = kind, view
+        if key in self._kept:
+            return self._kept[key]
+        if key in self._spill:
+            return self._spill.get(key)
         made = make(view)
         size = 0 if made is None else made.nbytes
         with _KEEPING:
-            if view in kept:  # another thread was faster
-                return kept[view]
+            if key in self._kept:  # another thread was faster
+                return self._kept[key]
             if self._bytes + size <= self._limit:
-                kept[view] = made
+                self._kept[key] = made
                 self._bytes += size
+                return made
+        if self._spills:
+            self._spill.add(key, made)
         return made
 
 
@@ -352,7 +369,7 @@ class Photos(Cached):
             `cameras`.
         background: RGB behind transparent pixels.
         exposures: (3, 4) exposures by view name, for photos that have one.
-        limit: bytes cached in memory.
+        limit: bytes kept in memory; further images are in a temporary file, see `Spill`.
 
     Raises:
         InputError: a view without a photo, an image that does not fit its view, or an exposure that is not
@@ -395,8 +412,6 @@ class Photos(Cached):
             )
         super().__init__(cameras, limit)
         self._background = background
-        self._masks: dict[int, NDArray[np.bool_] | None] = {}
-        self._alphas: dict[int, NDArray[np.float32] | None] = {}
         self._undo = {
             view: _invert_exposure(name, exposures[name])
             for view, name in enumerate(cameras.names)
@@ -415,23 +430,28 @@ class Photos(Cached):
 
     def mask(self, view: int) -> NDArray[np.bool_] | None:
         """Return the mask of valid pixels, or None."""
-        mask: NDArray[np.bool_] | None = self._cached(self._masks, view, partial(load_mask, self.cameras))
+        mask: NDArray[np.bool_] | None = self._cached("mask", view, partial(load_mask, self.cameras))
         return mask
 
     def alpha(self, view: int) -> NDArray[np.float32] | None:
         """Return the alpha, see `alpha_of`."""
-        alpha: NDArray[np.float32] | None = self._cached(self._alphas, view, self._alpha)
+        alpha: NDArray[np.float32] | None = self._cached("alpha", view, self._alpha)
         return alpha
 
     def _alpha(self, view: int) -> NDArray[np.float32] | None:
         own = load_photo(self.cameras, view, None)[0] if self._images is None else self._images[view]
         return _as_floats(own)[..., 3].copy() if own.shape[2] == 4 else None
 
+    def _stored(self, view: int) -> NDArray[Any]:
+        if self._images is not None and self._images[view].shape[2] == 3:
+            return self._images[view]  # in memory anyway
+        return super()._stored(view)
+
     def _make(self, view: int) -> NDArray[np.uint8 | np.float32]:
         if self._images is not None:
             return _composite(self._images[view], self._background)
         image, mask = load_photo(self.cameras, view, self._background)
-        self._cached(self._masks, view, lambda _: mask)
+        self._cached("mask", view, lambda _: mask)
         return np.rint(image * 255).astype(np.uint8)
 
     def __getitem__(self, view: int) -> NDArray[np.float32]:
@@ -446,10 +466,8 @@ class Photos(Cached):
         return photo
 
 
-def _composite(image: NDArray[Any], background: Colour) -> NDArray[np.uint8 | np.float32]:
+def _composite(image: NDArray[Any], background: Colour) -> NDArray[np.float32]:
     """Composite an image with alpha over the background."""
-    if image.shape[2] == 3:
-        return image
     floats = _as_floats(image)
     colour = np.array(background, np.float32)
     return np.ascontiguousarray(floats[..., :3] * floats[..., 3:] + colour * (1 - floats[..., 3:]))
@@ -478,7 +496,7 @@ class TeacherRenders(Cached):
         cameras: the views, world coordinates.
         background: RGB in [0, 1] behind the scene.
         settings: the renderer's conventions; None means gsplat's.
-        limit: bytes of renders cached in memory; further ones are rendered again on each access.
+        limit: bytes of renders kept in memory; further ones are in a temporary file, see `Spill`.
         lazy: render a view on first access instead of all at once.
         renderer: a shared renderer of the same teacher, background and settings; None creates one.
         progress: called with the number of views rendered.
@@ -512,13 +530,13 @@ class TeacherRenders(Cached):
         return [self._teacher, self._background, self._settings]
 
     def fill(self, progress: Progress, views: Sequence[int] | None = None) -> None:
-        """Render the views, all by default, that the cache will hold, so that later steps take equal time."""
+        """Render the views, all by default, so that later steps take equal time; stop if the disk is full."""
         views = range(len(self.cameras)) if views is None else views
-        missing = np.array([view for view in views if view not in self._kept], np.int64)
-        sizes = np.cumsum(3 * np.uint16().nbytes * self.cameras.pixels[missing])
-        count = int((sizes <= self._limit - self._bytes).sum())
-        for number, _ in enumerate(in_threads(self._stored, missing[:count].tolist()), 1):
-            progress("targets", number, count)
+        missing = [view for view in views if not self._spill.full and not self._holds(view)]
+        for number, _ in enumerate(in_threads(self._stored, missing), 1):
+            progress("targets", number, len(missing))
+            if self._spill.full:
+                break
         self._renderer = None  # its buffers are larger than the scene
 
     def _make(self, view: int) -> NDArray[np.uint16]:
@@ -548,7 +566,7 @@ class PhotosOrRenders(_Chosen):
     Args:
         teacher: the dense scene, or a function that returns its renders in some views.
         exposures: exposures of the photos, see `Photos`.
-        limit: bytes cached in memory per kind.
+        limit: bytes kept in memory per kind, see `Photos`.
         renders: further arguments of `TeacherRenders`.
     """
 

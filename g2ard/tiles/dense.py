@@ -182,6 +182,8 @@ class TileRenders(Cached):
         opacity: whether images are (H, W, 4), with alpha, and not limited to 1.
     """
 
+    _spills = False  # all images are in files of tasks
+
     def __init__(
         self, scene: InTiles, cameras: Cameras, background: Colour = BLACK, *, opacity: bool = False
     ) -> None:

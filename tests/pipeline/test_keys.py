@@ -79,15 +79,15 @@ KEYED: dict[type, tuple[Any, str]] = {
     ),
     Photos: (
         Photos(VIEWS, IMAGES, exposures=EXPOSURES),
-        "cameras _limit _kept _bytes _masks _alphas",
+        "cameras _limit _kept _bytes _spill",
     ),
     TeacherRenders: (
         TeacherRenders(BALL, VIEWS, settings=RasterSettings(), lazy=True),
-        "cameras _limit _kept _bytes _renderer",
+        "cameras _limit _kept _bytes _spill _renderer",
     ),
     TileRenders: (
         TileRenders(Tiles("a"), VIEWS),  # type: ignore[arg-type]
-        "cameras _limit _kept _bytes _files",
+        "cameras _limit _kept _bytes _spill _files",
     ),
     Subset: (Subset(Photos(VIEWS, IMAGES), [1, 0]), "cameras _places"),
 }

@@ -1,16 +1,34 @@
 """Targets: what is kept, at what precision, and what identifies it."""
 
+import errno
+import gc
 import os
+import pickle
+from collections.abc import Callable
 from dataclasses import replace
+from io import FileIO
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from g2ard.progress import silent
 from g2ard.rendering.renderer import Renderer
-from g2ard.rendering.targets import Photos, Subset, TeacherRenders, checked_targets, fill, fingerprint_of
-from helpers.photos import photographed
+from g2ard.rendering.targets import (
+    Cached,
+    Photos,
+    Subset,
+    TeacherRenders,
+    alpha_of,
+    checked_targets,
+    fill,
+    fingerprint_of,
+    mask_of,
+)
+from g2ard.scene.cameras import Cameras
 from helpers.scenes import around, checkered_ball
 from helpers.view_files import photo
 
@@ -24,17 +42,11 @@ def test_renders_are_kept_in_16_bits() -> None:
     assert sum(kept.nbytes for kept in targets._kept.values()) == 2 * 3 * sum(views.widths * views.heights)
 
 
-def test_no_more_is_rendered_than_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
-    ball, views = checkered_ball(400), around(12, (32, 24))
-    rendered: list[object] = []
-    real = Renderer.clipped
-    monkeypatch.setattr(Renderer, "clipped", lambda self, view: rendered.append(view) or real(self, view))
-    targets = TeacherRenders(ball, views, limit=5 * 2 * 3 * 32 * 24 + 99)
-    assert len(rendered) == len(targets._kept) == 5
+IMAGE_BYTES = 2 * 3 * 32 * 24
 
 
-@pytest.mark.parametrize("limit", [10**6, 4 * 2 * 3 * 32 * 24 + 99])
-def test_targets_are_filled_once_and_within_the_limit(limit: int, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("limit", [0, 4 * IMAGE_BYTES + 99, 10**6])
+def test_targets_are_filled_once(limit: int, monkeypatch: pytest.MonkeyPatch) -> None:
     ball, views = checkered_ball(400), around(12, (32, 24))
     rendered: list[str] = []
     real = TeacherRenders._make
@@ -47,20 +59,120 @@ def test_targets_are_filled_once_and_within_the_limit(limit: int, monkeypatch: p
     told: list[tuple[int, int]] = []
     for _ in range(2):
         fill(some, lambda stage, done, total, info=None: told.append((done, total)))
-    assert rendered == [views.names[row] for row in (7, 5, 1, 3)]
+    assert sorted(rendered) == sorted(views.names[row] for row in (7, 5, 1, 3))
     assert told == [(1, 3), (2, 3), (3, 3)]
     fill(targets, silent)
-    assert len(rendered) == len(targets._kept) == (12 if limit == 10**6 else 4)
+    assert len(rendered) == len(set(rendered)) == 12
+    assert len(targets._kept) == min(12, limit // IMAGE_BYTES)
 
 
-def test_masks_count_towards_the_limit(tmp_path: Path) -> None:
-    views = photographed(tmp_path, checkered_ball(400), around(6, (32, 24)))
-    photos = Photos(replace(views, mask_paths=views.image_paths[::-1]), limit=3 * (3 + 1) * 32 * 24 + 99)
-    for view in range(6):
-        assert photos[view].shape == (24, 32, 3)
-    kept = [*photos._kept.values(), *photos._masks.values()]
-    assert sum(array.nbytes for array in kept if array is not None) <= photos._limit
-    assert len(kept) == 6
+class NearlyFull(FileIO):
+    """A file that takes three writes, then only a part."""
+
+    writes = 0
+
+    def write(self, data: Any) -> int:
+        self.writes += 1
+        return super().write(data if self.writes <= 3 else bytes(data)[:9])
+
+
+def _refuse(**options: object) -> FileIO:
+    raise OSError(errno.EROFS, "read-only file system")
+
+
+@pytest.mark.parametrize(("cause", "written"), [("no room", 0), ("read-only", 0), ("nearly full", 3)])
+def test_targets_are_made_again_if_the_disk_is_full(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cause: str, written: int
+) -> None:
+    ball, views = checkered_ball(400), around(12, (32, 24))
+    want = list(TeacherRenders(ball, views))
+    name, double = {
+        "no room": ("disk_usage", lambda folder: SimpleNamespace(free=10**8)),
+        "read-only": ("TemporaryFile", _refuse),
+        "nearly full": ("TemporaryFile", lambda **_: NearlyFull(tmp_path / "file", "w+b")),
+    }[cause]
+    monkeypatch.setattr(f"g2ard.system.spill.{name}", double)
+    rendered: list[object] = []
+    real = Renderer.clipped
+    monkeypatch.setattr(Renderer, "clipped", lambda self, view: rendered.append(view) or real(self, view))
+    targets = TeacherRenders(ball, views, limit=5 * IMAGE_BYTES + 99)
+    rendered.clear()
+    fill(targets, silent)
+    assert not rendered
+    for _ in range(2):
+        for view in range(12):
+            np.testing.assert_array_equal(targets[view], want[view])
+    assert [targets._holds(view) for view in range(12)].count(True) == 5 + written
+
+
+def _pictured(folder: Path) -> Cameras:
+    """Views with photos that have alpha, and masks."""
+    views = around(6, (32, 24))
+    random = np.random.default_rng(0)
+    paths: dict[str, list[Path]] = {"photo": [], "mask": []}
+    for name in views.names:
+        for kind, channels in (("photo", 4), ("mask", 3)):
+            path = folder / f"{kind}-{Path(name).stem}.png"
+            Image.fromarray(random.integers(0, 256, (24, 32, channels), np.uint8)).save(path)
+            paths[kind].append(path)
+    return replace(views, image_paths=tuple(paths["photo"]), mask_paths=tuple(paths["mask"]))
+
+
+def _given_images(folder: Path, limit: int) -> Photos:
+    images = np.random.default_rng(1).random((6, 24, 32, 4)).astype(np.float32)
+    return Photos(around(6, (32, 24)), images, limit=limit)
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda folder, limit: Photos(_pictured(folder), limit=limit),
+        _given_images,
+        lambda folder, limit: TeacherRenders(checkered_ball(400), around(6, (32, 24)), limit=limit),
+    ],
+    ids=["photos", "images", "renders"],
+)
+def test_a_limit_changes_no_target(tmp_path: Path, make: Callable[[Path, int], Cached]) -> None:
+    def values(targets: Cached) -> list[Any]:
+        views = range(len(targets.cameras))
+        parts = [(targets[view], mask_of(targets, view), alpha_of(targets, view)) for view in views]
+        return [each for part in parts for each in part]
+
+    want = values(make(tmp_path, 10**9))
+    assert sum(each is not None for each in want) >= 6
+    for limit in (0, 3 * 32 * 24 * 5):
+        targets = make(tmp_path, limit)
+        for _ in range(2):  # made, then read
+            for got, expected in zip(values(targets), want, strict=True):
+                np.testing.assert_array_equal(got, expected)
+        kept = sum(array.nbytes for array in targets._kept.values() if array is not None)
+        assert kept == targets._bytes <= limit
+        assert not targets._spill.full
+        there = pickle.loads(pickle.dumps(targets))
+        assert not any(key in there._spill for key in targets._spill._places)
+        np.testing.assert_array_equal(there[5], targets[5])
+
+
+def test_a_target_from_the_file_can_be_changed() -> None:
+    targets = _given_images(Path(), 0)
+    first = targets[0]
+    targets[0][:] = 0.5
+    np.testing.assert_array_equal(targets[0], first)
+
+
+@pytest.mark.skipif(not Path("/proc/self/fd").exists(), reason="reads /proc")
+def test_the_file_disappears_with_its_targets() -> None:
+    def opened() -> int:
+        return len(list(Path("/proc/self/fd").iterdir()))
+
+    gc.collect()
+    before = opened()
+    targets = TeacherRenders(checkered_ball(400), around(3, (32, 24)), limit=0)
+    images = [targets[view] for view in range(3)]
+    assert opened() == before + 1
+    del targets, images
+    gc.collect()
+    assert opened() == before
 
 
 def test_a_replaced_photo_or_mask_changes_the_fingerprint(tmp_path: Path) -> None:
