@@ -51,8 +51,16 @@ _PACKED_BYTES = 200
 SH degree 1 and 3, 97 for 150,000 of degree 2, 118 for 250,000 of degree 3."""
 _PALETTE_BYTES = 1_300
 """Bytes per entry of the page's palette of harmonics, of which there are at most 65,536."""
-TRAINER_BYTES = 983
-"""Bytes per Gaussian in recovery: parameters, Adam's moments, buffers (`docs/benchmarks.md`)."""
+_TRAINER_TIMES = 4.0
+"""Memory of recovery as a multiple of the result's arrays: the parameters, Adam's two moments, and the scene
+that is scored. The start and the best scene so far are kept anyway."""
+_TRAINER_BYTES = 450
+"""Further bytes per Gaussian: anchors, and buffers of the rasteriser if a view sees all."""
+
+
+def trainer_bytes(count: int, degree: int) -> int:
+    """Return the memory of recovering `count` Gaussians of an SH degree, targets excluded."""
+    return int(count * (_TRAINER_BYTES + _TRAINER_TIMES * 4 * row_width(degree)))
 
 
 @dataclass(frozen=True)
@@ -105,7 +113,7 @@ def cost_of_recovery(
     """
     dense = 0 if teacher is None else int(_KEPT_TIMES * teacher.nbytes)
     memory = _PROGRAM_BYTES + _target_bytes(views, teacher) + _image_bytes(views)
-    memory += dense + int(_KEPT_TIMES * scene.nbytes) + TRAINER_BYTES * len(scene)
+    memory += dense + trainer_bytes(len(scene), scene.sh_degree)
     return Cost(sum(map(len, views)), _mean_pixels(views[0]), steps, memory)
 
 
@@ -155,7 +163,7 @@ def _peak_bytes(job: DistillJob, count: int, page: bool, *, trains: bool) -> int
     if count < rows <= LARGEST_DENSE:  # shown beside the result
         packing = max(packing, _packing_bytes(dense, job.prior.sh_degree))
     written = _KEPT_TIMES * scene + max(_sampled(_LOOKS, dense), packing if page else 0)
-    held = kept + int(max(_SCENE_TIMES * scene, scene + TRAINER_BYTES * count, written))
+    held = kept + int(max(_SCENE_TIMES * scene, scene + trainer_bytes(count, degree), written))
     return held if job.plan is None else max(held, job.plan.bytes)
 
 
@@ -195,7 +203,8 @@ def check_job_memory(job: DistillJob, most: int | None, need: int) -> None:
         largest = plan_round_counts(job.dense, job.budget.count, job.config)[0]
         message = f"--memory: recovering {plural(largest, 'Gaussian')} takes about "
         message += f"{format_bytes(need, ceil=True)}, "
-    message += f"more than {format_bytes(most)}; smaller views, --size, take less"
+    message += f"more than {format_bytes(most)}; "
+    message += "fewer Gaussians, a lower --sh-degree and smaller views, --size, take less"
     if job.plan is None and job.renders:  # tiles support this job
         tiles = TileMemory(count, 4 * row_width(job.prior.sh_degree), RECOVERY_TIMES)
         message += f"; in tiles {tiles.advice(most, max(1, count // 2))}"

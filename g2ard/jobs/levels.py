@@ -22,7 +22,7 @@ from g2ard.io.reports import Report
 from g2ard.io.scenes import tell
 from g2ard.jobs.budget import Budget
 from g2ard.jobs.comparison import is_made_of_points
-from g2ard.jobs.cost import TRAINER_BYTES, Cost, cost_of
+from g2ard.jobs.cost import Cost, cost_of, trainer_bytes
 from g2ard.jobs.distill import open_job
 from g2ard.jobs.distill_job import DistillJob
 from g2ard.jobs.distill_options import DistillOptions
@@ -168,7 +168,9 @@ class LevelsJob:
         job = replace(self.job, views=replace(self.job.views.resized(size), full=None))
         held_out = job.targets.held_out
         fill(held_out, job.progress)
-        fits = job.plan is None or TRAINER_BYTES * count <= job.plan.memory
+        degree = job.config.recover.sh_degree
+        degree = job.prior.sh_degree if degree is None else degree
+        fits = job.plan is None or trainer_bytes(count, degree) <= job.plan.memory
         if job.recovers and fits:
             done = job.reduce(finer, count, work)
             lost = job.dense.opacity_lost(done.splats, held_out.cameras)

@@ -145,8 +145,8 @@ def drift95(anchors: Anchors, means: Float32) -> float:
     if not len(means):
         return 0.0
     delta = means.astype(np.float64) - anchors.means
-    local = np.einsum("nji,nj->ni", anchors.frames.astype(np.float64), delta)
-    return float(np.percentile(np.abs(local[:, 2]) / anchors.r_perp, 95))
+    height = np.einsum("nj,nj->n", anchors.frames[:, :, 2].astype(np.float64), delta)
+    return float(np.percentile(np.abs(height) / anchors.r_perp, 95))
 
 
 _LIFT_THICKNESS = 0.2

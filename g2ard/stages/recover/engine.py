@@ -123,7 +123,7 @@ class FusedEngine:
             anchors.r_parallel,
             anchors.r_perp,
         )
-        self._trainer.anchor(*self._anchors)
+        self._anchor()
         if objective.frozen is not None:
             self._trainer.freeze(objective.frozen)
 
@@ -175,12 +175,17 @@ class FusedEngine:
     def load(self, state: dict[str, Values]) -> None:
         self._skipped_before = int(state["skipped"]) - self._trainer.skipped
         self._trainer.load(state)
-        self._trainer.anchor(*self._anchors)
+        self._anchor()
+
+    def _anchor(self) -> None:
+        """Give the trainer the anchors, whose copy takes memory, if regularisers pull towards them."""
+        if self._objective.regularizers.active:
+            self._trainer.anchor(*self._anchors)
 
     @property
     def counts(self) -> Values:
         """Number of steps that each Gaussian has taken, (N,)."""
-        return self._trainer.state()["steps"]
+        return self._trainer.steps()
 
     @property
     def skipped(self) -> int:

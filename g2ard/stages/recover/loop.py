@@ -120,7 +120,13 @@ class Loop:
     @property
     def skipped(self) -> int:
         """Number of single-Gaussian steps skipped because a gradient was not finite."""
-        return self.skipped_before + self.engine.skipped
+        built: Engine | None = vars(self).get("engine")
+        return self.skipped_before + (0 if built is None else built.skipped)
+
+    def _drop_engine(self) -> None:
+        """Free the engine, the largest part of a recovery's memory."""
+        self.skipped_before = self.skipped
+        del self.engine
 
     def _new_engine(self, start: Splats | None = None) -> Engine:
         """Create an engine that begins at `start`, by default at the student."""
@@ -233,11 +239,10 @@ class Loop:
         while True:
             try:
                 self._run(checkpoint, progress, stage, watch)
-                if self.validation_key is None:
-                    return self.engine.splats(), None
-                steps = self.done - (int(self.guard.backed_off[-1]["step"]) if self.guard.backed_off else 0)
-                seen = self.engine.counts * (len(self.targets.cameras) / max(1, steps))
-                return self.engine.splats(), seen
+                seen = None if self.validation_key is None else self._estimate_seen()
+                end = self.engine.splats()
+                self._drop_engine()
+                return end, seen
             except DeviceError:  # `system.devices.notes` has the reason
                 del self.engine
                 seconds = self.seconds
@@ -248,6 +253,12 @@ class Loop:
                     self._restore(copy.deepcopy(start), {"losses": np.zeros(0)})
                 self.seconds = seconds
                 self.resumed = resumed
+
+    def _estimate_seen(self) -> NDArray[np.float64]:
+        """Estimate the (N,) number of views that each Gaussian was seen in from its steps."""
+        backed_off = self.guard.backed_off
+        first = int(backed_off[-1]["step"]) if backed_off else 0
+        return self.engine.counts * (len(self.targets.cameras) / max(1, self.done - first))
 
     def _run(self, checkpoint: Path | None, progress: Progress, stage: str, watch: Watch | None) -> None:
         """Take the remaining steps."""
@@ -302,8 +313,7 @@ class Loop:
         self._look_at_exposures(scene, share)
         if self.guard.look(scene, share, self.done) == "back":
             self.multiplier /= 3
-            self.skipped_before += self.engine.skipped
-            del self.engine  # two engines at once would double the memory
+            self._drop_engine()  # two engines at once would double the memory
             self.engine = self._new_engine(self.guard.best)
 
     def _look_at_exposures(self, scene: Splats, share: float) -> None:

@@ -212,7 +212,6 @@ impl PyTrainer {
     fn arrays<'py>(&self, py: Python<'py>) -> PyResult<Vec<Bound<'py, PyArrayDyn<f32>>>> {
         let trained = work::locked(py, &self.trained);
         let (n, rest) = (trained.rows, trained.sh_coeffs - 1);
-        let values = work::quick(py, || noted(trained.inner.values()))?;
         let shapes = [
             vec![n, 3],
             vec![n, 4],
@@ -222,15 +221,17 @@ impl PyTrainer {
             vec![n, rest, 3],
         ];
         let starts = [0, 3, 7, 10, 11, 14, 14 + 3 * rest];
-        let columns = |at: &[usize]| -> Vec<f32> {
-            let rows = values.chunks_exact(14 + 3 * rest);
-            rows.flat_map(|row| &row[at[0]..at[1]]).copied().collect()
-        };
-        shapes
-            .into_iter()
-            .zip(starts.windows(2))
-            .map(|(shape, at)| PyArray1::from_vec(py, columns(at)).reshape(shape))
+        let columns = work::quick(py, || noted(trained.inner.columns(&starts)))?;
+        (columns.into_iter().zip(shapes))
+            .map(|(values, shape)| PyArray1::from_vec(py, values).reshape(shape))
             .collect()
+    }
+
+    /// Return the number of steps that each row has taken, (N,).
+    fn steps<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray1<u32>>> {
+        let trained = work::locked(py, &self.trained);
+        let steps = work::quick(py, || noted(trained.inner.steps()))?;
+        Ok(steps.into_pyarray(py))
     }
 
     /// Return everything that a bitwise resume needs: a dict of arrays.

@@ -120,6 +120,22 @@ pub trait Train: Send + Sync {
     /// Parameters in the layout of [`Exported::values`].
     fn values(&self) -> Result<Vec<f32>>;
 
+    /// The attributes between each two of these numbers, row-major: [`Train::values`] in parts.
+    fn columns(&self, starts: &[usize]) -> Result<Vec<Vec<f32>>> {
+        let values = self.values()?;
+        let width = starts.last().copied().unwrap_or(1);
+        let part = |at: &[usize]| {
+            let rows = values.chunks_exact(width);
+            rows.flat_map(|row| &row[at[0]..at[1]]).copied().collect()
+        };
+        Ok(starts.windows(2).map(part).collect())
+    }
+
+    /// How many steps each row has taken.
+    fn steps(&self) -> Result<Vec<u32>> {
+        Ok(self.export()?.steps)
+    }
+
     /// Everything that [`Train::import`] needs.
     fn export(&self) -> Result<Exported>;
 
@@ -292,6 +308,15 @@ impl Train for Trainer {
 
     fn values(&self) -> Result<Vec<f32>> {
         Ok(self.store.columns(0, self.store.attributes()))
+    }
+
+    fn columns(&self, starts: &[usize]) -> Result<Vec<Vec<f32>>> {
+        let parts = starts.windows(2);
+        Ok(parts.map(|at| self.store.columns(at[0], at[1])).collect())
+    }
+
+    fn steps(&self) -> Result<Vec<u32>> {
+        Ok(self.store.steps())
     }
 
     fn export(&self) -> Result<Exported> {

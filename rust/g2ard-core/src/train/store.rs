@@ -181,21 +181,28 @@ impl Store {
         }
     }
 
+    /// How many steps each Gaussian has taken, in the caller's order.
+    pub fn steps(&self) -> Vec<u32> {
+        let mut steps = vec![0; self.rows];
+        for (row, &to) in self.order.iter().enumerate() {
+            steps[to as usize] = self.steps[row];
+        }
+        steps
+    }
+
     /// Everything that [`Store::import`] needs.
     pub fn export(&self) -> Exported {
         let all = self.attributes();
         let mut units = vec![0.0; self.rows];
-        let mut steps = vec![0; self.rows];
         for row in 0..self.rows {
             units[self.order[row] as usize] = self.units[row / LANES].0[row % LANES];
-            steps[self.order[row] as usize] = self.steps[row];
         }
         Exported {
             values: self.unblock(&self.values, 0, all),
             first: self.unblock(&self.first, 0, all),
             second: self.unblock(&self.second, 0, all),
             units,
-            steps,
+            steps: self.steps(),
             order: self.order.clone(),
         }
     }
