@@ -112,7 +112,7 @@ def cost_of_recovery(
         teacher: scene that renders the targets; None if they are photos.
     """
     dense = 0 if teacher is None else int(_KEPT_TIMES * teacher.nbytes)
-    memory = _PROGRAM_BYTES + _target_bytes(views, teacher) + _image_bytes(views)
+    memory = _PROGRAM_BYTES + _target_bytes(views, teacher, CACHE_BYTES) + _image_bytes(views)
     memory += dense + trainer_bytes(len(scene), scene.sh_degree)
     return Cost(sum(map(len, views)), _mean_pixels(views[0]), steps, memory)
 
@@ -156,9 +156,9 @@ def _peak_bytes(job: DistillJob, count: int, page: bool, *, trains: bool) -> int
     chosen = job.config.select.count_of(len(train))
     used = [train if chosen == "auto" else train.take(range(min(chosen, len(train))))] if trains else []
     used += [*views.untrained, *filter(None, [views.twice])]
-    full = [] if views.full is None else [limit_pixels(views.full)]
-    targets = sum(_target_bytes(part, job.prior if job.renders else None) for part in (used, full))
-    kept = _PROGRAM_BYTES + _sampled(_SURVEY, dense) + targets + _image_bytes([*used, *full]) + 2 * small
+    used += [] if views.full is None else [limit_pixels(views.full)]
+    targets = _target_bytes(used, job.prior if job.renders else None, job.teaching.limit)
+    kept = _PROGRAM_BYTES + _sampled(_SURVEY, dense) + targets + _image_bytes(used) + 2 * small
     packing = _packing_bytes(count, degree)
     if count < rows <= LARGEST_DENSE:  # shown beside the result
         packing = max(packing, _packing_bytes(dense, job.prior.sh_degree))
@@ -167,12 +167,10 @@ def _peak_bytes(job: DistillJob, count: int, page: bool, *, trains: bool) -> int
     return held if job.plan is None else max(held, job.plan.bytes)
 
 
-def _target_bytes(views: Sequence[Cameras], teacher: Splats | None) -> int:
-    """Return the bytes of cached targets: renders in 16 bits, or photos in 8."""
-    values = 3 * sum(int(part.pixels.sum()) for part in views)
-    if teacher is not None:
-        values *= 2
-    return min(CACHE_BYTES, values)
+def _target_bytes(views: Sequence[Cameras], teacher: Splats | None, limit: int) -> int:
+    """Return the bytes of targets in memory, at most `limit` per part: renders in 16 bits, or photos in 8."""
+    pixel = 3 if teacher is None else 6
+    return sum(min(limit, pixel * int(part.pixels.sum())) for part in views)
 
 
 def _sampled(cost: tuple[int, int], count: int) -> int:

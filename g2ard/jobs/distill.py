@@ -383,14 +383,16 @@ def _choose_teaching(
         photos = start.needs_photos or any(paths)
     background = options.config.recover.background
     renders = not photos or None in paths
+    limit = options.target_bytes
     return Teaching(
-        partial(dense.images, background=background) if renders else None,
+        partial(dense.images, background=background, limit=limit) if renders else None,
         photos,
         background,
         chosen=options.find("recover.background") is not None,
         insisted=options.photos is True,
         rough=planned,
         say=say,
+        limit=limit,
     )
 
 

@@ -14,6 +14,7 @@ from g2ard.errors import InputError
 from g2ard.jobs.inputs import Views
 from g2ard.pipeline.config import DistillConfig
 from g2ard.pipeline.presets import PRESETS, configure
+from g2ard.rendering.targets import CACHE_BYTES
 from g2ard.stages.lift import LiftConfig
 from g2ard.stages.recover.anchors import Regularizers
 from g2ard.system.cached import cached_property
@@ -34,6 +35,7 @@ class DistillOptions(Settings):
             their photos; without views, its lift renders the training images.
         format: file format for a budget in bytes, a name in `g2ard.io.scene_formats.FORMATS`.
         time: seconds that the whole run may take; recovery gets what the rest leaves.
+        memory: bytes that the run may take; None is no limit.
         settings: values of `DistillConfig` by path, which override the preset.
 
     Others are those of `g2ard.distill`.
@@ -53,12 +55,18 @@ class DistillOptions(Settings):
     format: FormatName = "ply"
     preset: str = "auto"
     time: Positive | None = None
+    memory: AtLeastOne | None = None
     settings: Mapping[str, Any] = field(default_factory=dict)
 
     @cached_property
     def config(self) -> DistillConfig:
         """Configuration before the scene is measured; its regularisers are a trained scene's unless named."""
         return self.configure()
+
+    @property
+    def target_bytes(self) -> int:
+        """Bytes of images that targets of one kind of view keep in memory, at most a quarter of it."""
+        return CACHE_BYTES if self.memory is None else min(CACHE_BYTES, self.memory // 4)
 
     @property
     def focus(self) -> Focus | None:

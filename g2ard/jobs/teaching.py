@@ -16,7 +16,7 @@ from g2ard.jobs.view_checks import check_photos, propose_background, warn_of_sig
 from g2ard.pipeline.distill import RunViews
 from g2ard.progress import Say, plural, unsaid
 from g2ard.rendering.renderer import RasterSettings
-from g2ard.rendering.targets import Photos, PhotosOrRenders, Targets, TeacherRenders
+from g2ard.rendering.targets import CACHE_BYTES, Photos, PhotosOrRenders, Targets, TeacherRenders
 from g2ard.scene.cameras import USUAL, Cameras
 from g2ard.scene.splats import Splats
 from g2ard.system.cached import cached_property
@@ -41,6 +41,7 @@ class Teaching:
         chosen: whether the user chose the background.
         insisted: whether photos that show nothing of the scene are accepted.
         rough: whether this is for a dry run, which looks at no photo for its background.
+        limit: bytes of photos that memory keeps per set of targets, see `Photos`.
     """
 
     render: Callable[[Cameras], Targets] | None
@@ -50,6 +51,7 @@ class Teaching:
     insisted: bool = False
     rough: bool = False
     say: Say = unsaid
+    limit: int = CACHE_BYTES
 
     @classmethod
     def by(
@@ -92,9 +94,10 @@ class Teaching:
         exposures = find_exposures(cameras)
         if exposures:
             say(f"exposure.json: corrected the exposure of {plural(len(exposures), 'photo')}")
-        if self.render is None:
-            return Photos(cameras, background=self.background, exposures=exposures)
-        return PhotosOrRenders(cameras, self.render, background=self.background, exposures=exposures)
+        kind: Callable[..., Targets] = Photos
+        if self.render is not None:
+            kind = partial(PhotosOrRenders, teacher=self.render)
+        return kind(cameras, background=self.background, exposures=exposures, limit=self.limit)
 
     def full_size(self, cameras: Cameras | None) -> Targets | None:
         """Return targets of views at their own size, of large views only some (`limit_pixels`).

@@ -13,7 +13,7 @@ from g2ard.config.choices import BLACK, Colour
 from g2ard.errors import InputError
 from g2ard.io.stream import PartsStream
 from g2ard.progress import Progress, silent
-from g2ard.rendering.targets import Targets, TeacherRenders
+from g2ard.rendering.targets import CACHE_BYTES, Targets, TeacherRenders
 from g2ard.rendering.visibility import SampledVisibility, visibility_source
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats
@@ -71,8 +71,8 @@ class Dense(Protocol):
             views: that weigh Gaussians by visibility; None for none.
         """
 
-    def images(self, views: Cameras, background: Colour = BLACK) -> Targets:
-        """Return the scene's images in some views, made on access."""
+    def images(self, views: Cameras, background: Colour = BLACK, limit: int = CACHE_BYTES) -> Targets:
+        """Return the scene's images in some views, made on access; memory keeps `limit` bytes of them."""
 
     def opacity_lost(self, result: Splats, views: Cameras) -> float:
         """Return the share of light that a result lets through, see `g2ard.stages.simplify.gaps`."""
@@ -129,9 +129,9 @@ class InMemory:
             progress=progress,
         )
 
-    def images(self, views: Cameras, background: Colour = BLACK) -> Targets:
+    def images(self, views: Cameras, background: Colour = BLACK, limit: int = CACHE_BYTES) -> Targets:
         """Return renders of the scene."""
-        return TeacherRenders(self.splats, views, background=background, lazy=True)
+        return TeacherRenders(self.splats, views, background=background, limit=limit, lazy=True)
 
     def opacity_lost(self, result: Splats, views: Cameras) -> float:
         """Return the share of light that a result lets through."""

@@ -19,7 +19,7 @@ from g2ard.progress import Progress, silent
 from g2ard.rendering.boxes import front_to_back
 from g2ard.rendering.recolour import seen_by, shifted
 from g2ard.rendering.renderer import RasterSettings, Renderer, settings_for
-from g2ard.rendering.targets import Cached, Targets, unrounded
+from g2ard.rendering.targets import CACHE_BYTES, Cached, Targets, unrounded
 from g2ard.rendering.visibility import LONGEST, usual_and_others
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats
@@ -41,7 +41,7 @@ _VIEWS_PER_TASK = 32
 """Views that a task draws together, so that a tile is read once for them."""
 
 _KEPT_BYTES = 500_000_000
-"""Bytes of images kept in memory; further ones are read from their file again on each access."""
+"""Default of `TileRenders.limit`."""
 
 
 @dataclass(eq=False)
@@ -129,9 +129,9 @@ class InTiles:
         drawn.fill(progress)
         return shifted(small, chosen, shown, self.settings, progress)
 
-    def images(self, views: Cameras, background: Colour = BLACK) -> Targets:
+    def images(self, views: Cameras, background: Colour = BLACK, limit: int = CACHE_BYTES) -> Targets:
         """Return the scene's images in some views."""
-        return TileRenders(self, views, background)
+        return TileRenders(self, views, background, min(limit, _KEPT_BYTES))
 
     def opacity_lost(self, result: Splats, views: Cameras) -> float:
         """Return the share of light that a result lets through."""
@@ -179,15 +179,22 @@ class TileRenders(Cached):
     """Renders of a scene in tiles, drawn by its workers; see `TeacherRenders`.
 
     Args:
+        limit: bytes kept in memory; other images are read from their file again on each access.
         opacity: whether images are (H, W, 4), with alpha, and not limited to 1.
     """
 
     _spills = False  # all images are in files of tasks
 
     def __init__(
-        self, scene: InTiles, cameras: Cameras, background: Colour = BLACK, *, opacity: bool = False
+        self,
+        scene: InTiles,
+        cameras: Cameras,
+        background: Colour = BLACK,
+        limit: int = _KEPT_BYTES,
+        *,
+        opacity: bool = False,
     ) -> None:
-        super().__init__(cameras, _KEPT_BYTES)
+        super().__init__(cameras, limit)
         self._scene, self._background, self._opacity = scene, tuple(background), opacity
         self._files: dict[int, Path] = {}
 

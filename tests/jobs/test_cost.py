@@ -20,8 +20,10 @@ from g2ard.jobs.budget import Budget
 from g2ard.jobs.cost import cost_of
 from g2ard.jobs.distill import prepare
 from g2ard.jobs.distill_options import DistillOptions
+from g2ard.progress import silent
+from g2ard.rendering.targets import Cached, _Chosen, fill
 from helpers.commands import CommandLine, refused, succeeds
-from helpers.photos import photos_of
+from helpers.photos import photographed, photos_of
 from helpers.project import environment
 from helpers.scenes import around, checkered_ball
 from helpers.tiled_scenes import town_in
@@ -93,6 +95,32 @@ def test_memory_grows_with_views_and_gaussians(monkeypatch: pytest.MonkeyPatch) 
     both = cost_of(job, 90)  # its page holds the dense scene too
     monkeypatch.setattr("g2ard.jobs.cost.LARGEST_DENSE", 899)
     assert both.bytes > cost_of(job, 90).bytes > cost_of(job, 90, page=False).bytes
+
+
+@pytest.mark.parametrize("pictured", [False, True])
+def test_memory_limits_targets(pictured: bool, tmp_path: Path) -> None:
+    views = around(24, (400, 300))
+    if pictured:
+        views = photographed(tmp_path, checkered_ball(200), views)
+    free, limited = (
+        prepare(
+            checkered_ball(900),
+            Budget(90),
+            DistillOptions(views=views, memory=memory, settings={"focus": "far"}),
+        )
+        for memory in (None, 8_000_000)
+    )
+    bytes_of = 400 * 300 * (3 if pictured else 6)
+    spared = cost_of(free, 90).bytes - cost_of(limited, 90).bytes
+    assert spared > 20 * bytes_of - 2_000_000  # views of other kinds spare more
+    for job, most in ((free, 2_000_000_000), (limited, 2_000_000)):
+        train = job.targets.train
+        fill(train, silent)
+        images = [train[view] for view in range(len(train.cameras))]
+        targets = train._parts()[0][0] if isinstance(train, _Chosen) else train
+        assert isinstance(targets, Cached)
+        assert targets._bytes <= most
+        assert all(map(targets._holds, range(len(images))))
 
 
 _DISTIL = "--steps 4 --size 200"

@@ -125,6 +125,7 @@ def distill(
         raise typer.BadParameter(
             f"{scene} holds views, not a scene; to start from photos, pass it as --views with -n COUNT"
         )
+    tiling = read_tiling(run, source, output)
     options = DistillOptions(
         views=opt.with_images(views, images, alpha),
         photos=photos,
@@ -135,9 +136,9 @@ def distill(
         format=format,
         preset=preset,
         time=time,
+        memory=tiling.memory,
         settings=settings,
     )
-    tiling = read_tiling(run, source, output)
     how = tiling if source is not None and is_tiled(source, tiling) else None
     if scene is not None and budget is not None and how is None:
         say_fit(run, scene, budget, f"scene.{format}")

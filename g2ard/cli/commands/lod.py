@@ -202,7 +202,7 @@ def lod(
     noted = record_finish(run, meta) if tiled and not dry_run else nullcontext()
     options: dict[str, Any] = {"ratios": ratios, "recover": recover, "steps": steps, "background": colour}
     options |= {"split_sky": environment, "seed": run.seed, **run.callbacks}
-    options |= {"views": views, "size": size, "up": up, "beside": scene}
+    options |= {"views": views, "size": size, "up": up, "beside": scene, "memory": tiling.memory}
     with held, noted, open_levels(given, how, planned=dry_run, **options) as job:
         if dry_run:
             _tell_costs(run, job)
