@@ -131,8 +131,8 @@ def _unnamed(table: Float) -> list[str]:
     if grid and (count > 6 or whole[5:] == [True]):
         return ["row", "column", *_unnamed(table[:, 2:])]  # of a scan's grid, as FARO writes them
     names = ["x", "y", "z", *(["intensity"] if count == 4 else [f"column_{k + 1}" for k in range(3, count)])]
-    found = list[tuple[bool, bool, int]]()
-    alike = dict[int, float]()
+    found = []
+    alike = {}
     for start in _TRIPLES.get(count, ()):
         values = table[:, start : start + 3]
         top = table[:, start : start + 3].max(initial=0)
@@ -183,8 +183,8 @@ def _pcd(path: Path) -> tuple[list[str], Float]:
         raise
     except (KeyError, ValueError, IndexError, TypeError) as error:
         raise damaged(f"cannot be read as .pcd ({error})") from error
-    names = list[str]()
-    columns = list[Float]()
+    names = []
+    columns = []
     for field, name in zip(fields, rows.names or (), strict=False):
         own = table[name].reshape(len(table), -1)
         if field.lower() in ("rgb", "rgba") and own.dtype.itemsize == 4:

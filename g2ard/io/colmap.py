@@ -92,7 +92,7 @@ def _count(folder: Path) -> int:
 def models_below(path: Path) -> list[Path]:
     """Return the folders of models up to three levels below a folder, the nearest first."""
     level = [path]
-    found = list[Path]()
+    found = []
     for _ in range(3):
         inner = [sorted(p for p in folder.iterdir() if p.is_dir())[:_MOST_FOLDERS] for folder in level]
         level = [folder for folders in inner for folder in folders][:_MOST_FOLDERS]
@@ -213,8 +213,8 @@ def listed(views: ViewFiles) -> Listed:
         raise InputError("has no images", path=tables[1])
     names = [name for name, *_ in images_read]
     finder = Finder(images) if images else Finder.among(names, *_photo_folders(path, folder))
-    frames = list[Frame]()
-    faults = list[tuple[str, InputError]]()
+    frames = []
+    faults = []
     by_rig = _rig_poses(folder, tables[1].suffix.lower())
     stale = 0
     for name, key, number, own, fault in sorted(images_read, key=lambda image: image[0]):
@@ -453,7 +453,7 @@ def _camera(model: str, size: tuple[int, int], p: tuple[float, ...]) -> Lens:
 
 
 def _cameras(table: Table) -> dict[int, Lens | InputError]:
-    cameras: dict[int, Lens | InputError] = {}
+    cameras = {}
     for _ in table:
         key, kind, *size = table.take(_CAMERA)
         model, params = table.params(kind)
@@ -487,7 +487,7 @@ def _rig_poses(folder: Path, suffix: str) -> dict[tuple[int, int], Float]:
         return {}
     with parsing(rigs):
         sensors = _sensors(open_table(rigs, "rig"))
-    found: dict[tuple[int, int], Float] = {}
+    found = {}
     with parsing(frames):
         table = open_table(frames, "frame")
         for _ in table:
@@ -502,7 +502,7 @@ def _rig_poses(folder: Path, suffix: str) -> dict[tuple[int, int], Float]:
 
 def _sensors(table: Table) -> dict[tuple[int, int], Float | None]:
     """Return camera_from_rig by rig and camera; the first sensor of a rig is its origin."""
-    sensors: dict[tuple[int, int], Float | None] = {}
+    sensors = {}
     for _ in table:
         rig, count = table.take(_RIG)
         for number in range(count):

@@ -16,8 +16,8 @@ def find_exposures(cameras: Cameras) -> dict[str, Float]:
 
     It holds a 3×4 matrix C per photo, named with or without the suffix: photo = C·(render, 1).
     """
-    exposures: dict[str, Float] = {}
-    tables: dict[Path, dict[str, Float]] = {}
+    exposures = {}
+    tables = {}
     for name, photo in zip(cameras.names, cameras.image_paths, strict=True):
         if photo is None:
             continue

@@ -95,7 +95,7 @@ def _plain(splats: Splats) -> list[bytes]:
     """Return the parts of a .glb with float32 attributes."""
     attributes = _attributes(splats)
     views: list[Json] = []
-    accessors: list[Json] = []
+    accessors = []
     blobs = []
     start = 0
     for name, values in attributes.items():
@@ -387,8 +387,8 @@ def _shown(path: Path, document: _Document, binary: bytes) -> Iterator[tuple[Not
 
 def placed(parts: Iterable[tuple[Noted, Float]]) -> Noted | None:
     """Join parts by their (4, 4) placements, in the axes of a .ply; return None without parts."""
-    moved = list[Splats]()
-    notes = list[Note]()
+    moved = []
+    notes = []
     uneven = 0
     for (part, own), placement in parts:
         notes += [note for note in own if note not in notes]
@@ -510,7 +510,7 @@ def _nodes_shown(path: Path, document: _Document) -> set[int]:
     if not document.scenes:
         return every
     ahead = list(_entry(document.scenes, document.scene, Place(path).to("scene")).nodes)
-    found = set[int]()
+    found = set()
     while ahead:
         if (at := ahead.pop()) not in found:
             ahead += _entry(document.nodes, at, Place(path).to("scenes", document.scene, "nodes")).children
@@ -532,7 +532,7 @@ def _placements(path: Path, nodes: list[_Node], mesh: int, seen: set[int]) -> li
     for shown in (i for i in holders if i in seen):
         at: int | None = shown
         total = np.eye(4)
-        above = set[int]()
+        above = set()
         with np.errstate(over="ignore", invalid="ignore"):
             while at is not None:
                 if at in above:

@@ -152,9 +152,9 @@ def judge_storage(
     small, large = bulk_range(scales)
     faint, solid = bulk_range(opacities)
     enough = count >= _FEWEST
-    told: list[str] = []
+    told = []
     opaque = None if logs else 1.0
-    notes = list[Note]()
+    notes = []
     if faint >= 0 and solid > 0 and _are_whole(opacities):
         opaque = choose_white(opacities[:, None], full_scales(opacities.dtype)) if solid > 1 else 1.0
         if opaque > 1:

@@ -91,8 +91,8 @@ _UNITS = {9001: 1.0, 9002: 0.3048, 9003: 1200 / 3937}
 
 def _map_of(header: Any) -> tuple[str | None, float | None]:
     """Return the map system that a header states, by EPSG code or name, and the metres of its unit."""
-    systems = list[str]()
-    units = list[float]()
+    systems = []
+    units = []
     for record in header.vlrs:
         if record.record_id == 34735 and hasattr(record, "geo_keys"):
             codes = {key.id: key.value_offset for key in record.geo_keys}

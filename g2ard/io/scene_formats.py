@@ -101,7 +101,7 @@ def lost_in(path: AnyPath, splats: Splats, **options: object) -> list[Note]:
     from g2ard.io.types import Note
 
     output_format = scene_format(path)
-    notes = list[Note]()
+    notes = []
     is_spz = output_format.module == "spz" or options.get("compress") == "spz"
     if splats.antialiased and not (output_format.models or is_spz):  # SPZ inside a .glb has a flag for it
         suffix = output_format.suffix

@@ -345,7 +345,7 @@ def _listed(index: Path) -> list[Path]:
     names = content.filenames
     sky = content.environment
     files = [_chunk_at(index.parent / name.replace("\\", "/")) for name in names]
-    used: set[int] = set()
+    used = set()
     nodes = [(content.tree, Place(index).to("tree"))]
     while nodes:
         node, place = nodes.pop()

@@ -597,7 +597,7 @@ def telling(
     Args:
         read: returns the parts of the sample, of which there is at least one.
     """
-    found = list[tuple[Names, MarkedPoints]]()
+    found = []
     for names in choices or [()]:
         positions, values, noise = (np.concatenate(column) for column in zip(*read(names), strict=True))
         found.append((names, (positions, values, noise)))

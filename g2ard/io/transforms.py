@@ -144,7 +144,7 @@ def _frames(
     finder = Finder(among) if among else Finder.among(names, places, [folder])
     masks = Finder(folder, folder / "masks", above / "resized_anon_masks")
     apart = [(key, word) for key, word in _APART.items() if lists[key]]
-    frames: list[Frame] = []
+    frames = []
     for key, word in [("frames", "train" if apart else split), *apart]:
         item = "frame" if key == "frames" else f"{key} entry"
         for i, entry in enumerate(lists[key]):
@@ -305,7 +305,7 @@ def text_of(path: Path, cameras: Cameras, splits: Splits) -> str:
     """
     lenses = [intrinsics_of(cameras, i) for i in range(len(cameras))]
     shared = lenses[0] if all(lens == lenses[0] for lens in lenses) else {}
-    frames: list[Json] = []
+    frames = []
     for i, viewmat in enumerate(cameras.viewmats):
         photo, mask = (
             (cameras.image_paths[i], cameras.mask_paths[i]) if cameras.lenses[i] is None else (None, None)

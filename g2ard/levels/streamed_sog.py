@@ -216,7 +216,7 @@ def _round(values: Sequence[float] | Float) -> list[float]:
 
 def _list_named(path: Path) -> set[Path]:
     """Return the relative paths of all level files that the folder's `lod-meta.json` names."""
-    named: set[Path] = set()
+    named = set()
     meta = read_object(path / "lod-meta.json")
     parts = [*_filter_names(meta, "filenames", _CHUNK_META), *_filter_names(meta, "environment", _CHUNK_META)]
     for part in map(Path, parts):
