@@ -170,7 +170,9 @@ def atomic_output(path: AnyPath, overwrite: bool = False) -> AbstractContextMana
     so is a `path` that another process made in the meantime.
     """
     path = check_output(path, overwrite)
-    return _copied(path) if is_stream(path) else _renamed(path, overwrite, folder=False)
+    if is_stream(path):
+        return _copied(path)
+    return _renamed(path, overwrite, folder=False)
 
 
 def atomic_folder(path: AnyPath, overwrite: bool = False) -> AbstractContextManager[Path]:
@@ -229,7 +231,10 @@ def _pour(source: Path, stream: Path) -> None:
     for text in filter(None, (sys.stdout, sys.stderr)):
         text.flush()  # they may be the stream
     descriptor = _descriptor(stream)
-    opened = os.open(stream, os.O_WRONLY) if descriptor is None else os.dup(descriptor)  # at its position
+    if descriptor is None:
+        opened = os.open(stream, os.O_WRONLY)
+    else:
+        opened = os.dup(descriptor)  # at its position
     with source.open("rb") as content, open(opened, "wb") as target:
         shutil.copyfileobj(content, target)
 

@@ -56,7 +56,9 @@ class Stream(PointStream):
 
         self._names, sample = telling(choices, sampled)
         packed = self._names and self._names[0] in _PACKED
-        scales = [(255.0,)] if packed else [full_scales(kinds[name]) for name in self._names]
+        scales = [full_scales(kinds[name]) for name in self._names]
+        if packed:
+            scales = [(255.0,)]
         widest = max(scales, key=lambda scales: scales[-1], default=(1.0,))
         super().__init__(path, len(self._vertices), sample, widest)
         if not choices:

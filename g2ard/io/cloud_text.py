@@ -97,9 +97,12 @@ def _text(text: str) -> tuple[list[str], Float]:
         raise InputError("has no points")
     if any(mark in heading for mark in ",;\t"):
         rows = re.sub(r"(?<=([,;\t]))(?=\1|\n)", "nan", rows)  # empty fields
-    rows = rows.replace(f"\n{heading}\n", "\n") if heading else rows
+    if heading:
+        rows = rows.replace(f"\n{heading}\n", "\n")
     rows = re.sub(r"\n[ \t]*\d+[ \t]*(?=\n)", "", rows)  # numbers of points, one for each scan
-    known = [i for i, name in enumerate(names) if name in _COLUMNS] if named else None
+    known = None
+    if named:
+        known = [i for i, name in enumerate(names) if name in _COLUMNS]
     try:
         table = np.loadtxt(
             io.StringIO(plain_numbers(rows)), comments=("#", "//", "%"), usecols=known, ndmin=2

@@ -58,7 +58,8 @@ def model_folder(path: Path) -> Path | None:
 
 def _models(path: Path) -> list[Path]:
     """Return the folders of models, that of `path` or otherwise the one with the most images first."""
-    path = path.parent if path.is_file() else path
+    if path.is_file():
+        path = path.parent
     if _tables(path):
         return [path, *(folder for folder in _numbered(path.parent) if folder != path)]
     for sparse in (path / "sparse", path / "colmap" / "sparse"):
@@ -80,8 +81,10 @@ def _count(folder: Path) -> int:
     """Return the number of images of a model, 0 if they cannot be read."""
     tables = _tables(folder)
     try:
-        if tables is None or tables[1].suffix.lower() == ".txt":
-            return 0 if tables is None else len(_images(TextTable(tables[1], "image")))
+        if tables is None:
+            return 0
+        if tables[1].suffix.lower() == ".txt":
+            return len(_images(TextTable(tables[1], "image")))
         with tables[1].open("rb") as file:
             (count,) = _COUNT.packed.unpack(file.read(_COUNT.packed.size))
             return int(count)
@@ -107,7 +110,9 @@ def photos_beside(path: Path) -> tuple[Path, Path] | None:
     """Return (project, photos) if `path` is a folder of photos beside a model, such as images_4."""
     if not path.is_dir() or not path.name.startswith("images") or model_folder(path) is not None:
         return None
-    return (path.parent, path) if model_folder(path.parent) is not None else None
+    if model_folder(path.parent) is None:
+        return None
+    return (path.parent, path)
 
 
 def points_file(path: Path) -> Path | None:
@@ -117,7 +122,10 @@ def points_file(path: Path) -> Path | None:
     if folder is None:
         return None
     held = _held(folder)
-    return next((held[name] for name in _POINT_FILES if name in held), folder / "points3D.bin")
+    for name in _POINT_FILES:
+        if name in held:
+            return held[name]
+    return folder / "points3D.bin"
 
 
 def numbers_of(folder: Path, names: Sequence[str]) -> set[int]:
@@ -212,7 +220,7 @@ def listed(views: ViewFiles) -> Listed:
     if not images_read:
         raise InputError("has no images", path=tables[1])
     names = [name for name, *_ in images_read]
-    finder = Finder(images) if images else Finder.among(names, *_photo_folders(path, folder))
+    finder = Finder.among(images, names, *_photo_folders(path, folder))
     frames = []
     faults = []
     by_rig = _rig_poses(folder, tables[1].suffix.lower())
@@ -224,7 +232,10 @@ def listed(views: ViewFiles) -> Listed:
         if isinstance(camera, InputError):
             faults.append((name, camera))
             continue
-        pose = make_pose(own[:4], own[4:]) if fault is None and any(own[:4]) else None
+        if fault is None and any(own[:4]):
+            pose = make_pose(own[:4], own[4:])
+        else:
+            pose = None
         in_rig = by_rig.get((key, number))
         if in_rig is not None and (pose is None or not np.allclose(in_rig, pose, rtol=_SAME, atol=_SAME)):
             stale += pose is not None
@@ -311,7 +322,10 @@ class Table:
     def params(self, model: str) -> tuple[str, tuple[float, ...]]:
         """Return the name of a model of cameras, and its parameters, which come next."""
         number = int(model)
-        name = _MODELS[number] if 0 <= number < len(_MODELS) else f"number {number}"
+        if 0 <= number < len(_MODELS):
+            name = _MODELS[number]
+        else:
+            name = f"number {number}"
         count = _PARAMETERS.get(name, 0)
         return name, self.take(Columns.of(count * "d", *_params(count)))
 
@@ -380,7 +394,9 @@ class TextTable(Table):
         if name in _WORDS:
             return word
         if kind == "d" and (found := _NOT_FINITE.fullmatch(word)):
-            return math.inf if found["inf"] else math.nan
+            if found["inf"]:
+                return math.inf
+            return math.nan
         try:
             if "_" in word or not word.isascii():  # Python reads both
                 raise ValueError(word)
@@ -494,7 +510,9 @@ def _rig_poses(folder: Path, suffix: str) -> dict[tuple[int, int], Float]:
             _key, rig, *numbers, count = table.take(_FRAME)
             from_world = _known(numbers)
             for kind, sensor, image in [table.take(_DATA) for _ in range(count)]:
-                in_rig = sensors.get((rig, sensor)) if kind in _CAMERA_SENSOR else None
+                in_rig = None
+                if kind in _CAMERA_SENSOR:
+                    in_rig = sensors.get((rig, sensor))
                 if from_world is not None and in_rig is not None:
                     found[image, sensor] = in_rig @ from_world
     return found
@@ -509,7 +527,9 @@ def _sensors(table: Table) -> dict[tuple[int, int], Float | None]:
             kind, sensor = table.take(_SENSOR)
             pose: Float | None = np.eye(4)
             if number:
-                pose = _known(table.take(_IN_RIG)) if table.take(_HAS_POSE)[0] else None
+                pose = None
+                if table.take(_HAS_POSE)[0]:
+                    pose = _known(table.take(_IN_RIG))
             if kind in _CAMERA_SENSOR:
                 sensors[rig, sensor] = pose
     return sensors

@@ -228,14 +228,19 @@ def run_scene(path: AnyPath) -> Path:
     from g2ard.io.scene_formats import SUFFIXES
 
     files = (path / f"scene{suffix}" for suffix in SUFFIXES)
-    return next((file for file in files if file.is_file()), path)
+    for file in files:
+        if file.is_file():
+            return file
+    return path
 
 
 def run_views(path: AnyPath) -> Path:
     """Return the generated views in the folder of a `distill` run, or `path` itself."""
     path = Path(path)
     made = path / "views.json"
-    return made if run_scene(path) != path and made.is_file() else path
+    if run_scene(path) != path and made.is_file():
+        return made
+    return path
 
 
 def run_background(path: AnyPath) -> Colour | None:
@@ -269,7 +274,10 @@ def json_format(content: Any) -> str | None:
     keys = set(fields)
     if "format" not in keys and not isinstance(fields.get("views"), list):
         keys.discard("views")  # a number of views, say
-    return next((name for name, (own, needed) in _JSON.items() if own is kind and needed <= keys), None)
+    for name, (own, needed) in _JSON.items():
+        if own is kind and needed <= keys:
+            return name
+    return None
 
 
 def find_views(scene: AnyPath) -> Path | None:
@@ -292,7 +300,9 @@ def find_views(scene: AnyPath) -> Path | None:
     scene = Path(scene)
     own = (scene if scene.is_dir() else scene.parent).absolute()
     found = next(_cameras_of(own), None)
-    return found if found is None or scene.is_absolute() else Path(os.path.relpath(found))
+    if found is None or scene.is_absolute():
+        return found
+    return Path(os.path.relpath(found))
 
 
 def _cameras_of(own: Path) -> Iterator[Path]:
@@ -321,7 +331,9 @@ def _format_in(file: Path) -> str | None:
     from g2ard.io.jsonfile import read_any_json
 
     with suppress(InputError):
-        return json_format(read_any_json(file)) if file.is_file() else None
+        if not file.is_file():
+            return None
+        return json_format(read_any_json(file))
     return None
 
 
@@ -380,7 +392,9 @@ def _near(path: Path) -> str:
     if not path.parent.is_dir():
         return f", nor a folder {path.parent}"
     close = get_close_matches(path.name, [file.name for file in path.parent.iterdir()], 2)
-    return f"; did you mean {' or '.join(str(path.with_name(name)) for name in close)}?" if close else ""
+    if not close:
+        return ""
+    return f"; did you mean {' or '.join(str(path.with_name(name)) for name in close)}?"
 
 
 _NO_FOLDER = "is not a supported folder"
@@ -462,7 +476,9 @@ def _poses_above(path: Path) -> Path | None:
     files = transforms.files_of(above)
     if len(files) == 1:
         return next(iter(files))
-    return above if files or colmap.model_folder(above) or holds("inria", above) else None
+    if files or colmap.model_folder(above) or holds("inria", above):
+        return above
+    return None
 
 
 def _ply_format(path: Path) -> str:
@@ -476,7 +492,9 @@ def _ply_format(path: Path) -> str:
     if "packed_position" in properties:
         return "compressed_ply"
     scene_words = ("f_dc_", "rot_", "scale_", "opacity")
-    return "ply" if any(name.startswith(scene_words) for name in properties) else "cloud_ply"
+    if any(name.startswith(scene_words) for name in properties):
+        return "ply"
+    return "cloud_ply"
 
 
 def _json_format(path: Path) -> str:

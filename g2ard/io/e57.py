@@ -76,7 +76,9 @@ class Stream(JoinedClouds):
 
 
 def _more(count: int) -> str:
-    return f"; similar in {plural(count - 1, 'other scan')}" if count > 1 else ""
+    if count > 1:
+        return f"; similar in {plural(count - 1, 'other scan')}"
+    return ""
 
 
 class _Scan(PointStream):
@@ -175,7 +177,9 @@ def _limits(header: Any, name: str) -> tuple[float, float] | None:
         found = [float(header[limits][f"{name}{end}"].value()) for end in ("Minimum", "Maximum")]
     except Exception:  # libe57's own, for a structure without them
         return None
-    return (found[0], found[1]) if found[0] < found[1] else None
+    if found[0] < found[1]:
+        return (found[0], found[1])
+    return None
 
 
 def _images(file: Any) -> list[Any]:
@@ -257,11 +261,10 @@ def _frame(number: int, node: Any, folder: Path) -> Frame | str:
     if blob is None:
         return f"{stem} has no JPEG or PNG"
     photo = _copied(shown[blob], folder / f"{stem}{_SUFFIXES[blob]}")
-    mask = (
-        _copied(shown["imageMask"], folder / "masks" / f"{stem}.png")
-        if shown.isDefined("imageMask")
-        else None
-    )
+    if shown.isDefined("imageMask"):
+        mask = _copied(shown["imageMask"], folder / "masks" / f"{stem}.png")
+    else:
+        mask = None
     world_from_camera = _pose(node["pose"]) @ (_PANORAMA_AXES if kind == "spherical" else FLIP)
     return Frame(photo.name, invert_pose(world_from_camera), lens, photo, mask=mask, listed=photo.name)
 

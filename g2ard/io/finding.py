@@ -76,11 +76,16 @@ class Finder:
         self._listings: dict[Path, tuple[dict[str, Path], dict[str, Path]]] = {}
 
     @classmethod
-    def among(cls, names: Sequence[str], folders: Sequence[Path], around: Iterable[Path]) -> Finder:
-        """Return the finder in `folders`, or if they hold none of the names, in the first folder that holds
-        half of them: one of `around`, or a folder in these. A few like names may be of other photos."""
+    def among(
+        cls, given: Path | None, names: Sequence[str], folders: Sequence[Path], around: Iterable[Path]
+    ) -> Finder:
+        """Return the finder in the `given` folder, otherwise in `folders`, or if they hold none of the names,
+        in the first folder that holds half of them: one of `around`, or a folder in these. A few like names
+        may be of other photos."""
         from g2ard.io.types import Note
 
+        if given:
+            return cls(given)
         asked = names[:: max(1, len(names) // _ASKED)]
         expected = cls(*folders)
         if any(map(expected.find, asked)):
@@ -141,7 +146,9 @@ class Finder:
     def _listed(self, folder: Path) -> tuple[dict[str, Path], dict[str, Path]]:
         """Return the files and the folders of a folder by key; only photos have keys without suffix."""
         if folder not in self._listings:
-            held = sorted(folder.iterdir(), reverse=True) if folder.is_dir() else []
+            held = []
+            if folder.is_dir():
+                held = sorted(folder.iterdir(), reverse=True)
             held.sort(key=is_photo)  # those that can be read win over others of the same stem
             levels = [(path, _keys(path.name)) for path in held if path.is_dir() or usable(path)]
             files: dict[str, Path] = {}
@@ -163,7 +170,9 @@ def _keys(name: str) -> list[list[str]]:
 
 
 def _stem(name: str) -> str:
-    return Path(name).stem if is_a_photo(Path(name)) else name
+    if not is_a_photo(Path(name)):
+        return name
+    return Path(name).stem
 
 
 def _folded(name: str) -> str:
@@ -213,7 +222,8 @@ def readable(names: Sequence[str], files: Sequence[Path | None]) -> list[str]:
         for wrong in ("utf-8", "latin-1"):  # text in another character set is read as one of these
             with suppress(UnicodeError):
                 spelled = [name.encode(wrong, "surrogateescape").decode(own) for name in names]
-                best = spelled if agreeing(spelled) > agreeing(best) else best
+                if agreeing(spelled) > agreeing(best):
+                    best = spelled
     return best
 
 
@@ -234,7 +244,10 @@ def files_in(folder: Path, *suffixes: str) -> list[Path]:
 
 def photos_in(folder: Path, *, below: bool = False) -> list[Path]:
     """Return the photos in a folder that can be read, or also those below it, without masks beside them."""
-    files = sorted(filter(usable, folder.rglob("*"))) if below else files_in(folder)
+    if below:
+        files = sorted(filter(usable, folder.rglob("*")))
+    else:
+        files = files_in(folder)
     photos = [file for file in files if is_photo(file)]
     masks = {p.with_name(m.format(name=p.name, stem=p.stem)) for p in photos for m in _MASKS_BESIDE}
     return [photo for photo in photos if photo.with_name(photo.stem) not in masks]
@@ -282,6 +295,9 @@ def mask_folders(photo: Path, depth: int) -> list[tuple[Path, Path]]:
         size = own.name.partition("_")[2]  # images_4 goes with masks_4
         names = [f"{name}_{size}" for name in _MASK_FOLDERS if size] + list(_MASK_FOLDERS)
         names += [f"{own.name}_{name}" for name in _MASK_FOLDERS]
-        beside = {_folded(p.name): p for p in own.parent.iterdir() if p.is_dir()} if own.is_dir() else {}
+        if own.is_dir():
+            beside = {_folded(p.name): p for p in own.parent.iterdir() if p.is_dir()}
+        else:
+            beside = {}
         found += [(beside[key], photo.relative_to(own)) for name in names if (key := _folded(name)) in beside]
     return found

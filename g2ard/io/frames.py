@@ -126,7 +126,10 @@ def _fit_lens_to_photo(lens: Lens, photo: Path) -> tuple[Lens, bool]:
     A photo that cannot be read changes nothing.
     """
     with suppress(Exception), open_image(photo) as image:
-        size = swap_sides(image.size) if needs_turn(image, lens.size) else image.size
+        if needs_turn(image, lens.size):
+            size = swap_sides(image.size)
+        else:
+            size = image.size
         is_turned = orientation(image) != 1
         return (lens if lens.made or not have_same_aspect(size, lens.size) else lens.at(size)), is_turned
     return lens, False

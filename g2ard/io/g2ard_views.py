@@ -92,7 +92,9 @@ def _photo_lens(lens: _PhotoLens | None, place: Place) -> PhotoLens | None:
 def _exact(stored: Float, place: Place) -> Float:
     """Return the pose as stored if it is rigid to rounding, so that writing and reading change no bit."""
     nearest = make_rigid(stored, place)
-    return stored if len(stored) == 4 and np.allclose(nearest, stored, rtol=0, atol=1e-9) else nearest
+    if len(stored) == 4 and np.allclose(nearest, stored, rtol=0, atol=1e-9):
+        return stored
+    return nearest
 
 
 def _written(lens: PhotoLens | None) -> Json | None:
@@ -105,7 +107,10 @@ def _written(lens: PhotoLens | None) -> Json | None:
 def text_of(path: Path, cameras: Cameras, splits: Splits, weights: ArrayLike | None) -> str:
     """Return views, one per line, with exact floats; see `g2ard.io.write_views`."""
     count = len(cameras)
-    given = np.full(count, np.nan) if weights is None else np.asarray(weights, float)
+    if weights is None:
+        given = np.full(count, np.nan)
+    else:
+        given = np.asarray(weights, float)
     drawn = [None if np.isnan(weight) else weight for weight in given.tolist()]
     parts = list(splits) or [None] * count
     if len(parts) != count or len(drawn) != count:

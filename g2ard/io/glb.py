@@ -129,7 +129,8 @@ def spz_glb(splats: Splats, centre: Float | None = None) -> tuple[list[bytes], f
     The node's translation is the scene's `offset`, and `centre`, which makes coordinates small.
     """
     movable = centre is not None
-    centre = np.zeros(3) if centre is None else centre
+    if centre is None:
+        centre = np.zeros(3)
     bits = spz.fraction_bits(splats.means.astype(float) - centre, splats, movable=movable)
     splats = splats.take(packing_order(splats.means))
     means = (splats.means.astype(float) - centre) * (-1, 1, -1)
@@ -159,7 +160,9 @@ def spz_glb(splats: Splats, centre: Float | None = None) -> tuple[list[bytes], f
 
 def _extras(splats: Splats) -> Json:
     """Return what a node states of a scene that is turned: the axes of its coordinates."""
-    return {} if splats.axes == "RDF" else {"extras": {"g2ard": {"axes": splats.axes}}}
+    if splats.axes == "RDF":
+        return {}
+    return {"extras": {"g2ard": {"axes": splats.axes}}}
 
 
 def _about_y(splats: Splats) -> Splats:
@@ -329,7 +332,10 @@ def _chunks(path: Path) -> tuple[Any, bytes]:
 def _with_buffer(path: Path, document: Any) -> tuple[Any, bytes]:
     """Return the document of a .gltf and its only buffer, which it holds in base64 or names beside it."""
     buffers = document.get("buffers") if isinstance(document, dict) else None
-    uri = buffers[0].get("uri") if isinstance(buffers, list) and len(buffers) == 1 else None
+    if isinstance(buffers, list) and len(buffers) == 1:
+        uri = buffers[0].get("uri")
+    else:
+        uri = None
     if not isinstance(buffers, list) or not isinstance(uri, str):
         raise InputError("expected one buffer with a uri", hint="export it as .glb")
     document = {**document, "buffers": [{**buffers[0], "uri": None}]}
@@ -378,7 +384,9 @@ def _shown(path: Path, document: _Document, binary: bytes) -> Iterator[tuple[Not
     shown = _nodes_shown(path, document)
     for index, mesh in enumerate(document.meshes):
         held = [at for at, primitive in enumerate(mesh.primitives) if _has_splats(primitive)]
-        placements = _placements(path, document.nodes, index, shown) if held else []
+        placements = []
+        if held:
+            placements = _placements(path, document.nodes, index, shown)
         for at in held:
             within = Place(path).to("meshes", index, "primitives", at)
             scene = _primitive(within, document, binary, mesh.primitives[at])
@@ -451,7 +459,10 @@ def _attributes_of(place: Place, document: _Document, binary: bytes, names: Json
     raw = Raw.empty(len(means), (degree + 1) ** 2 - 1)
     draft = base not in names and "COLOR_0" in names
     color = values("COLOR_0", 4) if draft else np.zeros((0, 4), np.float32)
-    opacities = color[:, 3] if draft and opacity not in names else values(opacity, 1)[:, 0]
+    if draft and opacity not in names:
+        opacities = color[:, 3]
+    else:
+        opacities = values(opacity, 1)[:, 0]
     sh0 = (color[:, :3] - 0.5) / SH_C0 if draft else values(base, 3)
     notes = fill_linear(raw, values(f"{EXTENSION}:SCALE", 3), opacities, sh0)
     if draft:
@@ -516,7 +527,9 @@ def _nodes_shown(path: Path, document: _Document) -> set[int]:
             ahead += _entry(document.nodes, at, Place(path).to("scenes", document.scene, "nodes")).children
             found.add(int(at))
     splats = {i for i, mesh in enumerate(document.meshes) if any(map(_has_splats, mesh.primitives))}
-    return found if any(document.nodes[at].mesh in splats for at in found) else every
+    if any(document.nodes[at].mesh in splats for at in found):
+        return found
+    return every
 
 
 def _placements(path: Path, nodes: list[_Node], mesh: int, seen: set[int]) -> list[Float]:
@@ -543,7 +556,9 @@ def _placements(path: Path, nodes: list[_Node], mesh: int, seen: set[int]) -> li
         if not np.isfinite(total[:3, 3]).all():
             raise InputError(f"invalid translation {tuple(total[:3, 3].tolist())}")
         found.append(total * np.outer((*_GLTF_TURN, 1), (*_GLTF_TURN, 1)))
-    return found if holders else [np.eye(4)]
+    if holders:
+        return found
+    return [np.eye(4)]
 
 
 def _local(node: _Node) -> Float:

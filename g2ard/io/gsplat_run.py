@@ -21,7 +21,9 @@ def data_of(path: Path) -> Path | None:
     """Return the folder of a run's data, or None if it does not exist."""
     file = path / NAME if path.is_dir() else path
     named = read_settings(file).path("data_dir")
-    return None if named is None else below(file, named)
+    if named is None:
+        return None
+    return below(file, named)
 
 
 def read(views: ViewFiles) -> Listed:

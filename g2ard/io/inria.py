@@ -41,7 +41,7 @@ def read(views: ViewFiles) -> Listed:
     listed = checked(read_any_json(file), list[_Camera], Place(file), entries="camera")
     beside = images or file.parent / "images"
     names = [camera.img_name for camera in listed]
-    among = Finder(beside) if images else Finder.among(names, [beside], [file.parent])
+    among = Finder.among(images, names, [beside], [file.parent])
     finder = among if beside.is_dir() or among.notes else None
     frames = [_frame(Place(file, i, "camera"), camera, finder) for i, camera in enumerate(listed)]
     times = Counter(frame.name for frame in frames)

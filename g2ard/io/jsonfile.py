@@ -178,4 +178,6 @@ def _found(value: Any) -> str:
         return "an integer of many digits"
     if isinstance(value, str) and len(value) > _LONGEST_SHOWN_VALUE:
         value = f"{value[: _LONGEST_SHOWN_VALUE // 2]}…{value[-_LONGEST_SHOWN_VALUE // 4 :]}"
-    return f"the string {value!r}" if isinstance(value, str) else repr(value)
+    if isinstance(value, str):
+        return f"the string {value!r}"
+    return repr(value)

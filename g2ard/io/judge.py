@@ -134,7 +134,9 @@ class Reading:
 
     def sh0(self, values: Values) -> Values:
         """Return coefficients of band 0."""
-        return values if self.white is None else (values / self.white - 0.5) / SH_C0
+        if self.white is None:
+            return values
+        return (values / self.white - 0.5) / SH_C0
 
 
 @np.errstate(invalid="ignore")  # signalling NaNs
@@ -156,7 +158,9 @@ def judge_storage(
     opaque = None if logs else 1.0
     notes = []
     if faint >= 0 and solid > 0 and _are_whole(opacities):
-        opaque = choose_white(opacities[:, None], full_scales(opacities.dtype)) if solid > 1 else 1.0
+        opaque = 1.0
+        if solid > 1:
+            opaque = choose_white(opacities[:, None], full_scales(opacities.dtype))
         if opaque > 1:
             notes.append(Note("opacities", count, f"opacities are whole numbers, taken as 0 to {opaque:g}"))
     elif not logs and (faint < -_OUTSIDE or solid > 1 + _OUTSIDE):

@@ -52,7 +52,9 @@ def read(views: ViewFiles) -> Listed:
     place = Place(file)
     trained = checked(read_json(file), _Trained, place)
     D = _affine(trained.transform, place.to("transform"))
-    settings = read_settings(folder / CONFIG) if (folder / CONFIG).is_file() else None
+    settings = None
+    if (folder / CONFIG).is_file():
+        settings = read_settings(folder / CONFIG)
     frames, A, applied_scale = _data(replace(views, path=folder), settings)
     scale = trained.scale / applied_scale
     trained_from_saved = make_rigid(D @ np.linalg.inv(A), place.to("transform"))
@@ -147,7 +149,9 @@ def _split(frames: Sequence[Frame], options: Settings) -> Sequence[Frame]:
 def _optimized(settings: Settings | None) -> str | None:
     optimizer = settings and settings.block("pipeline", "model", "camera_optimizer")
     mode = optimizer[1].word("mode") if optimizer else None
-    return None if mode in (None, "off", "false") else mode
+    if mode in (None, "off", "false"):
+        return None
+    return mode
 
 
 def _moved(frame: Frame, transform: Float, scale: float) -> Frame:

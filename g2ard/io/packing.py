@@ -35,7 +35,9 @@ def own_place(stored: Splats) -> Json:
     """Return what a file states under "g2ard" of a scene `as_stored`: axes, and the offset in these axes."""
     offset = moved_axes(stored.offset, "RDF", stored.axes)
     own: Json = {"offset": offset.tolist()} if offset.any() else {}
-    return own if stored.axes == "RDF" else {**own, "axes": stored.axes}
+    if stored.axes == "RDF":
+        return own
+    return {**own, "axes": stored.axes}
 
 
 def rounding(splats: Splats, stored: Splats | Float) -> float:

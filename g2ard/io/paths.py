@@ -105,9 +105,12 @@ def plain_numbers(text: str) -> str:
     decimal = (
         re.search(r"\d,\d", sample) and not re.search(r"\d\.\d", sample) and re.search(r"\d[;\t ]", sample)
     )
-    text = re.sub(r"(?<=\d),(?=\d)", ".", text) if decimal else text
+    if decimal:
+        text = re.sub(r"(?<=\d),(?=\d)", ".", text)
     text = text.replace(",", " ").replace(";", " ")
-    return NOT_FINITE.sub("nan", text) if re.search(r"nan\(|#|n/?[aou]", text, re.IGNORECASE) else text
+    if not re.search(r"nan\(|#|n/?[aou]", text, re.IGNORECASE):
+        return text
+    return NOT_FINITE.sub("nan", text)
 
 
 _SAMPLE = 1 << 14  # characters that tell whether commas are decimal
@@ -138,7 +141,10 @@ def _inside(path: AnyPath, i: int, name: str) -> PurePosixPath:
     parts = PurePosixPath(PureWindowsPath(name.replace("\0", "")).as_posix()).parts
     kept = [part for part in parts if part not in ("..", "/", "//") and not part.endswith((":", ":/"))]
     if not kept or "\0" in name or max(len(part.encode(errors="replace")) for part in kept) > _LONGEST_NAME:
-        short = name if len(name) <= _LONGEST_NAME else f"{name[:_LONGEST_NAME]}…"
+        if len(name) <= _LONGEST_NAME:
+            short = name
+        else:
+            short = f"{name[:_LONGEST_NAME]}…"
         raise InputError(f"has the invalid file name {short!r}", path=path, index=i, item="view")
     return PurePosixPath(*kept)
 
@@ -156,7 +162,10 @@ def content_hash(path: Path) -> str:
 
 def user_cache() -> Path:
     """Return the folder in the user's cache for what can be made again or done without."""
-    usual = os.environ.get("LOCALAPPDATA") if sys.platform == "win32" else os.environ.get("XDG_CACHE_HOME")
+    if sys.platform == "win32":
+        usual = os.environ.get("LOCALAPPDATA")
+    else:
+        usual = os.environ.get("XDG_CACHE_HOME")
     try:
         cache = (Path(usual) if usual else Path.home() / ".cache") / "g2ard"
         cache.mkdir(parents=True, exist_ok=True)

@@ -76,7 +76,9 @@ def _read_words(path: Path, image: Any, upright: bool) -> Values:
     if raw.startswith("LA"):
         return low.view(">u2")[..., [0, 0, 0, 1]]
     words = np.asarray(image).astype(np.uint16) * 256 + low
-    return words[..., :3] if image.mode == "RGBX" else words
+    if image.mode == "RGBX":
+        return words[..., :3]
+    return words
 
 
 _BITS = (8, 10, 12, 14)

@@ -86,7 +86,9 @@ def read_size(path: Path, listed_in: Path | None = None, like: tuple[float, floa
     """Read width and height from a photo's header, upright by EXIF if only that fits the size `like`."""
     try:
         with open_image(path) as image:
-            return swap_sides(image.size) if needs_turn(image, like) else image.size
+            if needs_turn(image, like):
+                return swap_sides(image.size)
+            return image.size
     except InputError as error:
         raise error if listed_in is None else error.at(hint=f"it is listed in {listed_in}") from None
 
@@ -152,9 +154,13 @@ def describe_unreadable(photo: Path) -> str | None:
             with open_image(photo):
                 return None
         except InputError as error:
-            return f"{error.message.removeprefix('is ')} ({error.hint})" if error.hint else None
+            if not error.hint:
+                return None
+            return f"{error.message.removeprefix('is ')} ({error.hint})"
     sign = None if _begins_with(photo, PHOTOS) else foreign(photo)
-    return None if sign is None else f"{sign.what} ({sign.todo})"
+    if sign is None:
+        return None
+    return f"{sign.what} ({sign.todo})"
 
 
 def has_alpha(photo: Path) -> bool:

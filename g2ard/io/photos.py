@@ -60,13 +60,19 @@ def _load_image(cameras: Cameras, index: int) -> Float32:
     name = cameras.names[index]
     if path is None:
         raise InputError(f"({name}) has no photo", index=index, item="view", hint="pass views with photos")
-    named = None if cameras.source is None else f"{cameras.source} names it as view {name!r}"
+    if cameras.source is None:
+        named = None
+    else:
+        named = f"{cameras.source} names it as view {name!r}"
     target = int(cameras.widths[index]), int(cameras.heights[index])
     lens = _lens_of(cameras, index)
     size = target if lens is None else lens.size
     try:
         several = cameras.lenses[index] is not None  # views of one photo, which follow each other
-        image = _decode_once(path, _modification_time(path), size) if several else decode_photo(path, size)
+        if several:
+            image = _decode_once(path, _modification_time(path), size)
+        else:
+            image = decode_photo(path, size)
     except InputError as error:
         raise error.at(hint="; ".join(filter(None, (error.hint, named))) or None) from error
     height, width = image.shape[:2]
@@ -76,7 +82,9 @@ def _load_image(cameras: Cameras, index: int) -> Float32:
             path=path,
             hint="pass the uncropped photos that the poses were estimated from",
         )
-    return resize(image, target) if lens is None else _resample(image, lens, cameras.Ks[index], target)
+    if lens is None:
+        return resize(image, target)
+    return _resample(image, lens, cameras.Ks[index], target)
 
 
 def _lens_of(cameras: Cameras, index: int) -> PhotoLens | None:
@@ -150,10 +158,13 @@ def _load_mask(cameras: Cameras, index: int, image: Float32 | None) -> Mask | No
         mask = own[..., 3] > 0.5 if own.shape[2] == 4 else None
     else:
         mask = _threshold(_load_image(replace(cameras, image_paths=cameras.mask_paths), index))
-        mask = ~mask if path.name.lower().startswith(MOVING) else mask
-    if mask is None or held is None:
-        return held if mask is None else np.ascontiguousarray(mask)
-    return np.ascontiguousarray(mask & held)
+        if path.name.lower().startswith(MOVING):
+            mask = ~mask
+    if mask is None:
+        return held
+    if held is not None:
+        mask = mask & held
+    return np.ascontiguousarray(mask)
 
 
 _LABELS = 32 / 255  # brightest value below which the values of a mask are labels
@@ -189,7 +200,8 @@ def _sample(image: Float32, u: Float, v: Float, around: bool = False) -> Float32
         around: whether the last column is beside the first, as in a panorama.
     """
     height, width = image.shape[:2]
-    u = u if around else np.clip(u, 0, width - 1)
+    if not around:
+        u = np.clip(u, 0, width - 1)
     v = np.clip(v, 0, height - 1)
     left = np.floor(u).astype(int)
     above = np.floor(v).astype(int)

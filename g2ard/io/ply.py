@@ -145,7 +145,10 @@ class Stream(RawStream):
             raw.log_scales[:, 2] = raw.log_scales[:, :2].min(axis=1) + _FLAT_LOG_RATIO
         elif len(self._scales) == 1:
             raw.log_scales[:, 1:] = raw.log_scales[:, :1]
-        quats = self._columns(block, self._quats) if self._quats else np.array([[1.0, 0, 0, 0]])
+        if self._quats:
+            quats = self._columns(block, self._quats)
+        else:
+            quats = np.array([[1.0, 0, 0, 0]])
         raw.quats[:] = quats - (128.0 if quats.dtype == np.uint8 else 0.0)  # of bytes, 128 is 0
         raw.logit_opacities[:] = self._read.opacity_logits(block[self._names["opacity"]])
         if _FILTER in self._names:

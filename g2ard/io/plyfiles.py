@@ -106,7 +106,9 @@ class _Plain(io.BufferedReader):
     def read(self, size: int | None = -1, /) -> bytes:
         data = super().read(size)
         within = self.tell() <= self._end
-        return data.translate(_ASCII) if within else data
+        if not within:
+            return data
+        return data.translate(_ASCII)
 
 
 def scene_names(properties: Sequence[str]) -> dict[str, str]:
@@ -129,7 +131,9 @@ def is_mesh(header: PlyHeader) -> bool:
 def groups_of(header: PlyHeader) -> list[str]:
     """Return the element of vertices, or those of reduced-3dgs for the SH degrees, vertex_0 and on."""
     groups = sorted(name for name in header.counts if re.fullmatch(r"vertex_\d", name))
-    return ["vertex"] if "vertex" in header.counts or not groups else groups
+    if "vertex" in header.counts or not groups:
+        return ["vertex"]
+    return groups
 
 
 def offset_of(header: PlyHeader) -> Float:
@@ -169,7 +173,9 @@ def render_model_of(comments: Sequence[str]) -> RenderModel | Literal["2dgs"]:
     'classic'
     """
     modes = [_RENDER_MODES[text] for c in comments if (text := c.lower()) in _RENDER_MODES]
-    return modes[-1] if modes else "classic"
+    if not modes:
+        return "classic"
+    return modes[-1]
 
 
 def up_of(comments: Sequence[str]) -> tuple[float, float, float] | None:

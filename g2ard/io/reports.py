@@ -70,7 +70,9 @@ def plain(value: Any) -> Any:
     """Return a report or array as JSON values, and anything else as text, for `json.dumps`."""
     if isinstance(value, Report):
         return value.as_dict()
-    return value.tolist() if hasattr(value, "tolist") else str(value)
+    if hasattr(value, "tolist"):
+        return value.tolist()
+    return str(value)
 
 
 def _nested(value: Any) -> Any:

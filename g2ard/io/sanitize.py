@@ -219,4 +219,6 @@ def logits_of(alphas: Values) -> Values:
 def _finite_rows(values: Values) -> Mask:
     flat = values.reshape(len(values), -1)
     finite = np.isfinite(flat)
-    return np.ones(len(flat), bool) if finite.all() else np.all(finite, axis=1)
+    if finite.all():
+        return np.ones(len(flat), bool)
+    return np.all(finite, axis=1)

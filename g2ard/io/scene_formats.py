@@ -122,7 +122,10 @@ def _unstated(path: AnyPath, splats: Splats) -> str | None:
     form = form_of(splats)
     if form.axes == "RDF" and not form.offset.any():
         return None
-    move = f" --translate={','.join(f'{v:.12g}' for v in form.offset)}" if form.offset.any() else ""
+    if form.offset.any():
+        move = f" --translate={','.join(f'{v:.12g}' for v in form.offset)}"
+    else:
+        move = ""
     turn = "" if form.axes == "RDF" else f" --to-axes {form.axes}"
     return (
         "cannot state map coordinates: positions are relative to the scene's middle, y down; "
@@ -174,7 +177,9 @@ class Rounding:
         error, typical = self._worst
         size = f"a typical Gaussian has a scale of {typical:.2g}"
         text = f"positions are rounded by up to {error:.2g} units; {size}"
-        return [Note("rounded_positions", self._count, text)] if self._told else []
+        if not self._told:
+            return []
+        return [Note("rounded_positions", self._count, text)]
 
 
 def axes_note(path: AnyPath, options: dict[str, Any]) -> str | None:

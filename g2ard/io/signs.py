@@ -211,14 +211,18 @@ def sign_of(path: Path) -> Sign | None:
     """Return what a file is, or None if it is unknown or cannot be read."""
     with suppress(OSError):
         head = _head(path).lower()
-        return next((sign for sign in SIGNS if sign.fits(path, head)), None)
+        for sign in SIGNS:
+            if sign.fits(path, head):
+                return sign
     return None
 
 
 def foreign(path: Path) -> Sign | None:
     """Return what a file is, if it is of another program and not read."""
     sign = sign_of(path)
-    return None if sign is None or sign.reads else sign
+    if sign is None or sign.reads:
+        return None
+    return sign
 
 
 def _head(path: Path) -> bytes:

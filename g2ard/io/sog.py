@@ -88,7 +88,10 @@ class _Meta(msgspec.Struct):
     @property
     def render_model(self) -> RenderModel:
         """The render model: `model`, or in older files `antialias`."""
-        states = self.model == "antialiased" if self.model is not None else self.antialias is True
+        if self.model is not None:
+            states = self.model == "antialiased"
+        else:
+            states = self.antialias is True
         return "antialiased" if states else "classic"
 
 
@@ -142,9 +145,15 @@ class _Chunk:
 
     def count(self) -> int:
         meta = self.meta
-        count = meta.count if meta.version == 2 else next(iter(meta.means.shape), None)
+        if meta.version == 2:
+            count = meta.count
+        else:
+            count = next(iter(meta.means.shape), None)
         if count is None:
-            place = self.file.to("count") if meta.version == 2 else self.file.to("means", "shape", 0)
+            if meta.version == 2:
+                place = self.file.to("count")
+            else:
+                place = self.file.to("means", "shape", 0)
             raise place.error("is missing")
         first = meta.means.files[0]
         with self.open_image(first) as image:  # before allocating memory
@@ -322,8 +331,8 @@ class _Levels(msgspec.Struct):
 
 def chunks_of(path: Path) -> list[Path]:
     """Return the folders of a scene's chunks at the finest level; [] if `path` is not a SOG scene."""
-    if path.is_file():
-        path = path.parent if path.name == "meta.json" else path
+    if path.is_file() and path.name == "meta.json":
+        path = path.parent
     if (path / "meta.json").is_file():
         return [path]
     if path.name == "lod-meta.json" or (path / "lod-meta.json").is_file():
@@ -372,13 +381,17 @@ def _listed(index: Path) -> list[Path]:
 
 def _chunk_at(file: Path) -> Path:
     """Return the place of a chunk: its archive, or the folder of its meta.json."""
-    return file if file.suffix.lower() == ".sog" else file.parent
+    if file.suffix.lower() == ".sog":
+        return file
+    return file.parent
 
 
 def _own(chunks: list[_Chunk]) -> _Own:
     """Return what g2ard stored under "g2ard"; the defaults if it is missing or chunks differ."""
     found = {chunk.meta.g2ard for chunk in chunks}
-    return found.pop() if len(found) == 1 else _Own()
+    if len(found) == 1:
+        return found.pop()
+    return _Own()
 
 
 def _left_out(path: Path, read_count: int) -> list[Note]:
@@ -388,7 +401,9 @@ def _left_out(path: Path, read_count: int) -> list[Note]:
         return []
     others = len(list(folder.glob("*/meta.json"))) - read_count
     text = f"{plural(others, 'other SOG folder')} ignored (coarser levels of detail)"
-    return [Note("ignored_chunks", others, text)] if others > 0 else []
+    if others > 0:
+        return [Note("ignored_chunks", others, text)]
+    return []
 
 
 class Stream(RawStream):

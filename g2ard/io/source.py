@@ -80,7 +80,9 @@ class Source:
     @cached_property
     def _points(self) -> PointStream:
         stream: PointStream = self._joined("points") if self.others else self._opened("points")
-        return self.through(stream) if self.through else stream
+        if not self.through:
+            return stream
+        return self.through(stream)
 
     def cloud(self, *, bare: bool = False) -> PointStream:
         """Return the point cloud in blocks.
@@ -104,12 +106,16 @@ class Source:
         if self.kind == "points":
             return self._points.system
         store = self.store if self.kind == "splats" else None
-        return None if store is None else store.system
+        if store is None:
+            return None
+        return store.system
 
     @property
     def metres_per_unit(self) -> float | None:
         """Metres of the unit of a point cloud that states it."""
-        return self._points.metres_per_unit if self.kind == "points" else None
+        if self.kind == "points":
+            return self._points.metres_per_unit
+        return None
 
     @property
     def notes(self) -> Notes:
@@ -167,4 +173,6 @@ def joined(sources: Sequence[Source]) -> SceneStream | PointStream:
     if all(source.kind == "points" for source in sources):
         return joined_clouds([source.cloud() for source in sources])
     scenes = [source.scene for source in sources]
-    return scenes[0] if len(scenes) == 1 else JoinedScenes(scenes)
+    if len(scenes) == 1:
+        return scenes[0]
+    return JoinedScenes(scenes)

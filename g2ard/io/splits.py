@@ -51,7 +51,10 @@ def split_mask(views: Views, names: Sequence[str], which: str, *, stated: Splits
     if which not in masks:
         raise InputError(f"no split {which!r} (there are {', '.join(sorted(masks))})", path=views)
     if not masks[which].any():
-        of = "its only view is not" if len(names) == 1 else f"none of its {len(names)} views is"
+        if len(names) == 1:
+            of = "its only view is not"
+        else:
+            of = f"none of its {len(names)} views is"
         raise InputError(f"{of} in split {which!r}; add a split.json that says which are", path=views)
     return masks[which]
 
@@ -157,7 +160,10 @@ def _read_apart(views: Path) -> tuple[str, list[str]] | None:
 
 def _places(views: Path) -> list[Path]:
     folder = views if views.is_dir() else views.parent
-    above = 2 if folder.name.isdecimal() and folder.parent.name == "sparse" else int(folder.name == "sparse")
+    if folder.name.isdecimal() and folder.parent.name == "sparse":
+        above = 2
+    else:
+        above = int(folder.name == "sparse")
     return [folder, *folder.parents[:above]]
 
 
@@ -205,4 +211,6 @@ def same_photos(files: Sequence[Path | None], others: Sequence[Path | None], *, 
 
 
 def _size(path: Path) -> int | None:
-    return path.stat().st_size if path.is_file() else None
+    if not path.is_file():
+        return None
+    return path.stat().st_size

@@ -88,7 +88,10 @@ def decoded(path: Path, data: bytes) -> Noted:
     sizes = _sizes(data)
     version, count, degree, fraction_bits, flags, stream_count = struct.unpack_from("<IIBBBB", data, 4)
     stored = _COEFFICIENTS[degree]
-    streams = _zstd_streams(data, stream_count, sizes) if version == 4 else _slices(data, sizes)
+    if version == 4:
+        streams = _zstd_streams(data, stream_count, sizes)
+    else:
+        streams = _slices(data, sizes)
     positions, alphas, colors, scales, rotations, sh = (np.frombuffer(s, np.uint8) for s in streams)
 
     kept = min(stored, 15)
@@ -140,7 +143,9 @@ def _in_place(path: Path, scene: Splats, own: bytes) -> Splats:
 def _comment(data: bytes) -> bytes:
     """Return the comment of a gzip header whose only optional part it is."""
     commented = data[:3] == b"\x1f\x8b\x08" and data[3:4] == bytes([_COMMENTED])
-    return data[10 : data.find(b"\0", 10)] if commented else b""
+    if not commented:
+        return b""
+    return data[10 : data.find(b"\0", 10)]
 
 
 def _extensions(data: bytes) -> tuple[Axes, bytes, int]:
@@ -158,7 +163,8 @@ def _extensions(data: bytes) -> tuple[Axes, bytes, int]:
             (number,) = struct.unpack_from("<I", data, at + 8)
             if number > len(_ADOBE_AXES):
                 raise InputError(f"unknown coordinate system {number}; expected 0 to 16")
-            axes = _ADOBE_AXES[number - 1] if number else axes
+            if number:
+                axes = _ADOBE_AXES[number - 1]
         elif kind == _OWN_PLACE:
             own = data[at + 8 : at + 8 + size]
         else:
@@ -218,7 +224,10 @@ def _zstd_streams(data: bytes, stream_count: int, sizes: list[int]) -> list[byte
     for i, (size, (packed, unpacked)) in enumerate(zip(sizes, entries, strict=False)):
         if start + packed > len(data):
             raise damaged(f"truncated in stream {i}")
-        stream = _unpacked(data[start : start + packed], size) if size == unpacked > 0 else b""
+        if size == unpacked > 0:
+            stream = _unpacked(data[start : start + packed], size)
+        else:
+            stream = b""
         if unpacked != size or len(stream) != size:
             raise damaged(f"stream {i} does not hold {size:,} bytes")
         streams.append(stream)
@@ -305,7 +314,9 @@ def write(
     named: Axes = axes if spz_version == 4 else "RUB"
     if own and axes != named:
         own["stored"] = axes
-    comment = json.dumps({"g2ard": own}, separators=(",", ":")).encode() if own else b""
+    comment = b""
+    if own:
+        comment = json.dumps({"g2ard": own}, separators=(",", ":")).encode()
     content = encoded(splats, means, bits, spz_version, named, progress, comment)
     with atomic_output(path, overwrite) as temporary:
         temporary.write_bytes(content)
@@ -397,7 +408,10 @@ def fraction_bits(means: Float, splats: Splats, *, movable: bool = False) -> int
     coarsest = max(float(np.median(middle)), 2.0**-_USUAL_BITS)
     if bits >= 0 and 2.0**-bits <= coarsest:
         return bits
-    away = np.abs(means - np.median(means, axis=0)).max(axis=1) if movable else reach
+    if movable:
+        away = np.abs(means - np.median(means, axis=0)).max(axis=1)
+    else:
+        away = reach
     far = np.flatnonzero(away * (1 + 2**-20) > 2.0 ** (23 - max(0, math.ceil(-math.log2(coarsest)))))
     steps = f"(steps of {2.0**-bits:g})"
     if 2 * len(far) > len(means):

@@ -120,7 +120,10 @@ class Stream(ABC, Generic[Block]):
         """
         known = self._reading
         self._reading = None
-        blocks = known[1] if known and known[0] == (kind, first) else getattr(self, kind)(rows, first)
+        if known and known[0] == (kind, first):
+            blocks = known[1]
+        else:
+            blocks = getattr(self, kind)(rows, first)
         for tally in self.tallies():
             tally.clear()
         at = first
@@ -129,7 +132,10 @@ class Stream(ABC, Generic[Block]):
             if block is None:
                 raise InputError("was changed while it was read", path=self.path)
             yield block
-            at = at + len(block) if kind == "positions" else first + sum(t.rows for t in self.tallies())
+            if kind == "positions":
+                at = at + len(block)
+            else:
+                at = first + sum(t.rows for t in self.tallies())
         if last < self.count and not self._is_copy:  # which would hold itself, and the file, in memory
             self._reading = (kind, last), blocks
 
@@ -260,7 +266,9 @@ class PartsStream(SceneStream):
         return stream
 
     def identity(self) -> list[Any]:
-        return super().identity() if self._identity is None else self._identity
+        if self._identity is None:
+            return super().identity()
+        return self._identity
 
     def whole(self) -> Splats:
         if len(self.counts) > 1:
@@ -329,10 +337,12 @@ class PointStream(Stream[RawPoints]):
         zeros = int(np.count_nonzero(good & ~placed))
         away = bool((np.abs(middle) > _FAR * np.linalg.norm(extent)).any() and extent.any())
         self._zeros_are_lost = away or zeros > max(_FEW_BLACK, _BLACK_SHARE * len(good))
-        good = placed if self._zeros_are_lost and placed.any() else good
+        if self._zeros_are_lost and placed.any():
+            good = placed
         self.sample = positions[good]
         notes = (*notes, *note_coarse(self.sample, spacing(self.sample, count)))
-        notes = (*notes, _DEGREES) if _in_degrees(middle, extent) else notes
+        if _in_degrees(middle, extent):
+            notes = (*notes, _DEGREES)
         super().__init__(path, count, np.rint(middle) if far else None, notes, "point")
         self.channels = values.shape[1]
         self.scales = scales
@@ -519,7 +529,9 @@ class JoinedScenes(Joined[Splats], SceneStream):
 
     def _moved(self, means: Float32, offset: Float) -> Float32:
         shift = offset - self.offset
-        return (means + shift).astype(np.float32) if shift.any() else means
+        if not shift.any():
+            return means
+        return (means + shift).astype(np.float32)
 
 
 class JoinedClouds(Joined[RawPoints], PointStream):
@@ -538,7 +550,8 @@ class JoinedClouds(Joined[RawPoints], PointStream):
         PointStream.__init__(self, streams[0].path, sum(s.count for s in streams), sample)
         self.channels = max(stream.channels for stream in streams)
         self.lack = streams[0].lack
-        self.axes = streams[0].axes if len({stream.axes for stream in streams}) == 1 else self.axes
+        if len({stream.axes for stream in streams}) == 1:
+            self.axes = streams[0].axes
         stated = {stream.system: stream.path.name for stream in reversed(streams) if stream.system}
         if len(stated) > 1:
             words = ", ".join(f"{name} in {system}" for system, name in reversed(stated.items()))
@@ -573,7 +586,9 @@ class JoinedClouds(Joined[RawPoints], PointStream):
 
 def joined_clouds(streams: Sequence[PointStream]) -> PointStream:
     """Return several point clouds as one."""
-    return streams[0] if len(streams) == 1 else JoinedClouds(streams)
+    if len(streams) == 1:
+        return streams[0]
+    return JoinedClouds(streams)
 
 
 def _far_apart(streams: Sequence[PointStream]) -> Iterator[Note]:
@@ -601,7 +616,10 @@ def telling(
     for names in choices or [()]:
         positions, values, noise = (np.concatenate(column) for column in zip(*read(names), strict=True))
         found.append((names, (positions, values, noise)))
-    return next((each for each in found if has_contrast(each[1][1][~each[1][2]])), found[0])
+    for each in found:
+        if has_contrast(each[1][1][~each[1][2]]):
+            return each
+    return found[0]
 
 
 def ranges(counts: Sequence[int], rows: int) -> list[tuple[int, int]]:

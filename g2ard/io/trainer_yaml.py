@@ -33,8 +33,11 @@ class Settings:
             if _indent(line) <= self._indent or not line.strip():
                 break
             text += " " + line.strip()
-        text = text[1:-1] if len(text) > 1 and text[0] == text[-1] and text[0] in "'\"" else text
-        return None if text in ("null", "~") else text
+        if len(text) > 1 and text[0] == text[-1] and text[0] in "'\"":
+            text = text[1:-1]
+        if text in ("null", "~"):
+            return None
+        return text
 
     def path(self, key: str) -> Path | None:
         """Return a value as a path; None if it is missing, null or empty."""
@@ -45,14 +48,21 @@ class Settings:
         if text.startswith("*"):
             anchor = re.escape(text[1:])
             at = next((i for i, line in enumerate(self._lines) if re.search(rf"&{anchor}\b", line)), None)
-            text = "" if at is None else self._lines[at].split(": ", 1)[-1].strip()
+            if at is None:
+                text = ""
+            else:
+                text = self._lines[at].split(": ", 1)[-1].strip()
         match = _PATH.match(text)
         if at is None or match is None:
             word = self.word(key)
-            return None if word is None else Path(word)
+            if word is None:
+                return None
+            return Path(word)
         parts = self._items(at)
         pure = PureWindowsPath if match["kind"] == "Windows" else PurePosixPath
-        return Path(pure(*parts).as_posix()) if parts else None
+        if not parts:
+            return None
+        return Path(pure(*parts).as_posix())
 
     def block(self, key: str, *deeper: str) -> tuple[str, Settings] | None:
         """Return the tag (class) and the block of a key, or of a key in its block; None if it is missing."""
@@ -60,7 +70,9 @@ class Settings:
         if at is None:
             return None
         block = Settings(self._lines, at + 1, self._indent + 2)
-        return block.block(*deeper) if deeper else (self._text(at, key), block)
+        if deeper:
+            return block.block(*deeper)
+        return (self._text(at, key), block)
 
     def _find(self, key: str) -> int | None:
         start = " " * self._indent + key + ":"
@@ -100,7 +112,10 @@ def below(start: Path, path: Path) -> Path | None:
     if found := next((place / path for place in (*folders, Path()) if (place / path).exists()), None):
         return found
     ends = (place.joinpath(*parts[k:]) for k in range(len(parts)) for place in (*folders, Path()))
-    return next((end for end in ends if end.exists() and real_path(end) not in folders), None)
+    for end in ends:
+        if end.exists() and real_path(end) not in folders:
+            return end
+    return None
 
 
 def _indent(line: str) -> int:

@@ -141,7 +141,7 @@ def _frames(
     above = path.parent.parent
     names = [str(entry.get("file_path")) for entry in lists["frames"] if isinstance(entry, dict)]
     places = [folder, folder / "images", above / "resized_images"]
-    finder = Finder(among) if among else Finder.among(names, places, [folder])
+    finder = Finder.among(among, names, places, [folder])
     masks = Finder(folder, folder / "masks", above / "resized_anon_masks")
     apart = [(key, word) for key, word in _APART.items() if lists[key]]
     frames = []
@@ -251,11 +251,10 @@ def _pinhole(place: Place, frame: _Frame, size: Size) -> Lens:
         return Lens((width, height), K, distortion)
     if frame.fl_x is UNSET:
         fx = _focal(place, "camera_angle_x", frame.camera_angle_x, width)
-        fy = (
-            _focal(place, "camera_angle_y", frame.camera_angle_y, height)
-            if frame.fl_y is UNSET
-            else frame.fl_y
-        )
+        if frame.fl_y is UNSET:
+            fy = _focal(place, "camera_angle_y", frame.camera_angle_y, height)
+        else:
+            fy = frame.fl_y
     else:  # beside fl_x, camera_angle_y may be of another camera
         fx = frame.fl_x
         fy = frame.fl_x if frame.fl_y is UNSET else frame.fl_y
@@ -292,7 +291,10 @@ def _size(place: Place, frame: _Frame, photo: Path) -> Size:
         if width is not UNSET and height is not UNSET:
             return width, height
     if photo.is_file():
-        stated = None if frame.cx is UNSET or frame.cy is UNSET else (2 * frame.cx, 2 * frame.cy)
+        if frame.cx is UNSET or frame.cy is UNSET:
+            stated = None
+        else:
+            stated = (2 * frame.cx, 2 * frame.cy)
         return read_size(photo, place.path, stated)
     error = place.error(f"has neither w and h nor a photo {photo}")
     raise error.at(hint="{images=DIR} names the folder of photos that are elsewhere")

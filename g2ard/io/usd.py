@@ -80,8 +80,9 @@ def _attributes(splats: Splats) -> dict[str, tuple[str, Float32]]:
 
 
 def _print(file: TextIO, splats: Splats, progress: Progress) -> None:
-    own = f'    customLayerData = {{\n        string {_AXES} = "{splats.axes}"\n    }}\n'
-    own = "" if splats.axes == "RDF" else own
+    own = ""
+    if splats.axes != "RDF":
+        own = f'    customLayerData = {{\n        string {_AXES} = "{splats.axes}"\n    }}\n'
     file.write(
         f'#usda 1.0\n(\n{own}    defaultPrim = "{_NAME}"\n    metersPerUnit = 1\n    upAxis = "Y"\n)\n\n'
         f'def {_SCHEMA} "{_NAME}"\n{{\n'
@@ -200,7 +201,12 @@ def _nothing(path: Path, held: list[Any], fields: int) -> str:
             f"holds surfels (flat particles), which are not supported; export the scene as .ply or {_SCHEMA}"
         )
     types = sorted({str(prim.GetTypeName()) for prim in held} - {"", "Xform", "Scope"})
-    todo = f": {MESH}" if "Mesh" in types else f": {SCAN}" if "Points" in types else ""
+    if "Mesh" in types:
+        todo = f": {MESH}"
+    elif "Points" in types:
+        todo = f": {SCAN}"
+    else:
+        todo = ""
     return f"has no prim of type {_SCHEMA}" + (f", only {', '.join(types[:4])}{todo}" if types else "")
 
 
@@ -248,13 +254,17 @@ def _color_space(pxr: Any, prim: Any) -> str:
 
 
 def _earliest(pxr: Any, attribute: Any) -> Any:
-    return attribute.Get(pxr.Usd.TimeCode.EarliestTime()) if attribute else None
+    if not attribute:
+        return None
+    return attribute.Get(pxr.Usd.TimeCode.EarliestTime())
 
 
 def _given(pxr: Any, prim: Any, name: str) -> Any:
     """Return the earliest value of an attribute with a value in it, or None."""
     values = _earliest(pxr, prim.GetAttribute(name))
-    return values if values is not None and len(values) else None
+    if values is not None and len(values):
+        return values
+    return None
 
 
 def _values(pxr: Any, prim: Any, name: str, width: int, count: int | None) -> Float32:

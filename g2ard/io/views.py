@@ -138,8 +138,10 @@ def read_view_set(
         raise InputError("no such folder of photos", path=given.images)
     with about(path):  # also for an invalid name of a photo, or a folder that cannot be read
         views = make_view_set(module.read(replace(given, path=path)))
-    views = views if unpictured else drop_unpictured(views)
-    views = use_alpha_as_masks(views) if given.alpha == "mask" else views
+    if not unpictured:
+        views = drop_unpictured(views)
+    if given.alpha == "mask":
+        views = use_alpha_as_masks(views)
     return views.take(split_mask(path, views.cameras.names, split, stated=views.splits))
 
 

@@ -218,7 +218,10 @@ class _Tiles:
         count = sum(map(len, rows))
         if count > self.most and node.children:
             return list(chain.from_iterable(self.of(part, level) for part in below))
-        finer = list(chain.from_iterable(self.of(part, level - 1) for part in below)) if level else []
+        if level:
+            finer = list(chain.from_iterable(self.of(part, level - 1) for part in below))
+        else:
+            finer = []
         if not count:
             return finer
         error = 0.0
@@ -252,7 +255,9 @@ def _describe_tile(node: Node, error: float, children: list[dict[str, Any]]) -> 
         "geometricError": error,
         "refine": "REPLACE",
     }
-    return {**tile, "children": children} if children else tile
+    if not children:
+        return tile
+    return {**tile, "children": children}
 
 
 def _list_named(file: Path) -> set[Path]:

@@ -176,7 +176,7 @@ def test_a_folder_with_a_few_of_the_names_holds_other_photos(tmp_path: Path) -> 
     names = [f"{k}.png" for k in range(8)]
     for held in range(1, 9):
         (tmp_path / "new" / names[held - 1]).write_bytes(b"photo")
-        found = Finder.among(names, [tmp_path / "images"], [tmp_path])
+        found = Finder.among(None, names, [tmp_path / "images"], [tmp_path])
         assert (found.find(names[0]) is not None) == (held >= 4)
 
 
