@@ -51,7 +51,7 @@ def write_animation(
 def _check_sizes(path: Path, shape: tuple[int, ...], frames: Iterable[Bytes]) -> Iterator[Bytes]:
     for frame in frames:
         if frame.shape != shape:
-            sizes = " and ".join(f"{width}×{height}" for height, width, _ in (shape, frame.shape))
+            sizes = f"{shape[1]}×{shape[0]} and {frame.shape[1]}×{frame.shape[0]}"
             raise InputError(f"views of one size make an animation, got {sizes}", path=path)
         yield np.ascontiguousarray(frame)
 

@@ -16,7 +16,7 @@ from tempfile import TemporaryDirectory
 from uuid import uuid4
 
 from g2ard.errors import OutputError
-from g2ard.io.paths import AnyPath, real_path
+from g2ard.io.paths import AnyPath, is_special, real_path
 
 _LONGEST_NAME = 255  # bytes of the longest file name of usual file systems
 
@@ -67,7 +67,7 @@ def is_taken(path: Path) -> bool:
 
 def is_stream(path: Path) -> bool:
     """Return whether a path is a device, a pipe or an open file of this process, so that it is written to."""
-    return _descriptor(path) is not None or (path.exists() and not (path.is_file() or path.is_dir()))
+    return _descriptor(path) is not None or is_special(path)
 
 
 def _descriptor(path: Path) -> int | None:
@@ -221,7 +221,8 @@ def _copied(path: Path) -> Iterator[Path]:
 
 def _failure(error: OSError, path: Path, temporary: Path) -> OSError:
     """Return the `OutputError` of a failed output, or the error itself if it is about another file."""
-    elsewhere = error.filename is not None and not str(error.filename).startswith((str(temporary), str(path)))
+    own = str(temporary), str(path)
+    elsewhere = error.filename is not None and not str(error.filename).startswith(own)
     if elsewhere or isinstance(error, OutputError):
         return error
     return OutputError(f"cannot write: {error.strerror or error}", path=path)

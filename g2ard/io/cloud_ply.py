@@ -1,6 +1,7 @@
 """Reader and writer for coloured point clouds in .ply files."""
 
 from collections.abc import Iterable, Iterator
+from itertools import repeat
 from pathlib import Path
 
 import numpy as np
@@ -45,10 +46,10 @@ class Stream(PointStream):
         self.fields = tuple(self._named)
         (self._vertices,) = read_element(path, header, "vertex")
         rows = spread_rows(self._vertices)
-        choices = [names for names in COLOR_NAMES if set(names) <= set(self._named)]
-        choices += [(name,) for name in (*_PACKED, *_INTENSITIES) if name in self._named]
         kinds = {name: self._vertices.dtype[own] for name, own in self._named.items()}
-        choices = [names for names in choices if names[0] not in _PACKED or kinds[names[0]].itemsize == 4]
+        packed_names = [name for name in _PACKED if name in kinds and kinds[name].itemsize == 4]
+        choices = [names for names in COLOR_NAMES if kinds.keys() >= set(names)]
+        choices += [(name,) for name in (*packed_names, *_INTENSITIES) if name in kinds]
 
         def sampled(names: Names) -> list[MarkedPoints]:
             self._names = names
@@ -77,22 +78,24 @@ class Stream(PointStream):
         """Return positions, (n, 3) colours, (n, 1) intensities or (n, 0), and that none is noise."""
         columns = [rows[self._named[name]] for name in self._names]
         if len(columns) == 3:
-            columns = [_color(self.path, c, name) for c, name in zip(columns, self._names, strict=True)]
+            columns = list(map(_color, repeat(self.path), columns, self._names))
         elif columns and self._names[0] in _PACKED:
             columns = unpack_colors(columns[0])
         columns += [rows[self._named[name]] for name in self.also]
         noise = np.zeros(len(rows), bool)
         with np.errstate(invalid="ignore", over="ignore"):  # a signalling NaN
-            positions = np.stack([rows[self._named[axis]].astype(float) for axis in _POSITION], axis=1)
-            return positions, np.stack([noise, *columns], axis=1)[:, 1:].astype(np.float32), noise
+            places = [rows[self._named[axis]].astype(float) for axis in _POSITION]
+            values = np.stack([noise, *columns], axis=1)[:, 1:]  # `stack` needs a column
+            return np.stack(places, axis=1), values.astype(np.float32), noise
 
 
 def _color(path: Path, values: Values, name: str) -> Float32:
-    finite = values[np.isfinite(values)] if values.dtype.kind == "f" else values
+    finite = values[np.isfinite(values)]
     scales = full_scales(values.dtype)
     low = float(finite.min(initial=0))
     top = float(finite.max(initial=0))
-    if low < (-0.5 if values.dtype.kind == "f" else 0) or top > scales[-1] * 1.001:
+    least = -0.5 if values.dtype.kind == "f" else 0
+    if low < least or top > scales[-1] * 1.001:
         beyond = low if low < 0 else top
         raise InputError(f"has a value of {beyond:g}, expected [0, {scales[-1]:g}]", path=path, property=name)
     with np.errstate(invalid="ignore"):  # a signalling NaN
@@ -107,7 +110,8 @@ def write_blocks(path: Path, count: int, blocks: Iterable[Points], *, overwrite:
         if not (np.isfinite(points.positions).all() and np.isfinite(points.colors).all()):
             raise InputError("not written: a point is not finite")
         colors = np.rint(np.clip(points.colors, 0, 1) * 255)
-        return unstructured_to_structured(np.hstack([points.positions, colors]), np.dtype([*types.items()]))
+        rows = np.hstack([points.positions, colors])
+        return unstructured_to_structured(rows, np.dtype([*types.items()]))
 
     if not count:
         raise InputError("not written: there are no points", path=path)

@@ -44,19 +44,24 @@ class Stream(HeldPoints):
     """Points of a table, which is read whole. Without colours they are grey by their intensities."""
 
     def __init__(self, path: Path) -> None:
-        names, table = _pcd(path) if path.suffix.lower() == ".pcd" else _text(read_text(path))
+        if path.suffix.lower() == ".pcd":
+            names, table = _pcd(path)
+        else:
+            names, table = _text(read_text(path))
         if not len(table):
             raise InputError("has no points")
         if "rgb" in names and "red" not in names:
             packed = table[:, names.index("rgb")]
             whole = (packed == np.rint(packed)).all()
-            table = np.column_stack([table, *unpack_colors(packed.astype("<u4" if whole else "<f4"))])
-            names = [*names[: table.shape[1] - 3], "red", "green", "blue", *names[table.shape[1] - 3 :]]
+            colors = unpack_colors(packed.astype("<u4" if whole else "<f4"))
+            names[table.shape[1] : table.shape[1]] = ["red", "green", "blue"]  # before unread columns
+            table = np.column_stack([table, *colors])
         column = {name: names.index(name) for name in _COLUMNS if name in names}
         if missing := [name for name in "xyz" if name not in column]:
             raise InputError(f"has no column {missing[0]!r} (found {' '.join(names)})")
         shades: tuple[str, ...] = next((names for names in _SHADES if set(names) <= set(column)), ())
-        positions, values = (table[:, [column[name] for name in names]] for names in ("xyz", shades))
+        positions = table[:, [column[axis] for axis in "xyz"]]
+        values = table[:, [column[name] for name in shades]]
         columns = dict(zip(names, table.T, strict=False))
         super().__init__(path, positions, values, full_scales(np.dtype(float)), columns)
         if not shades:
@@ -111,7 +116,8 @@ def _text(text: str) -> tuple[list[str], Float]:
         text = str(error).partition(";")[0]
         raise InputError(f"is not a table of numbers: {text}") from error
     if known is not None:
-        names = [names[i] for i in known] + [name for i, name in enumerate(names) if i not in known]
+        unread = [name for name in names if name not in _COLUMNS]
+        names = [*(names[i] for i in known), *unread]
     elif table.size:
         names = _unnamed(table)
     return names, table
@@ -130,22 +136,32 @@ def _unnamed(table: Float) -> list[str]:
     """Return the names of columns without a heading, by their number and values."""
     count = table.shape[1]
     whole = [bool((values == np.rint(values)).all()) for values in table.T]
-    grid = whole[:5] == [True, True, False, False, False] and table[:, :2].min() >= 0
+    grid = whole[:5] == [True, True, False, False, False]
+    grid = grid and table[:, :2].min() >= 0
     if grid and (count > 6 or whole[5:] == [True]):
         return ["row", "column", *_unnamed(table[:, 2:])]  # of a scan's grid, as FARO writes them
-    names = ["x", "y", "z", *(["intensity"] if count == 4 else [f"column_{k + 1}" for k in range(3, count)])]
+    further = [f"column_{k + 1}" for k in range(3, count)]
+    if count == 4:
+        further = ["intensity"]
+    names = ["x", "y", "z", *further]
     found = []
     alike = {}
     for start in _TRIPLES.get(count, ()):
-        values = table[:, start : start + 3]
-        top = table[:, start : start + 3].max(initial=0)
-        if values.min(initial=0) >= 0 and ((all(whole[start : start + 3]) and top <= 65535) or top <= 1):
-            varying = bool(np.ptp(values, axis=0).all())
-            found.append((not varying, top > 255, start))
-            alike[start] = float(np.abs(np.corrcoef(values.T)).min()) if varying else 0.0
+        columns = slice(start, start + 3)
+        values = table[:, columns]
+        top = values.max(initial=0)
+        most = 65535 if all(whole[columns]) else 1
+        if not (values.min(initial=0) >= 0 and top <= most):  # also NaN
+            continue
+        varying = bool(np.ptp(values, axis=0).all())
+        found.append((not varying, top > 255, start))
+        alike[start] = 0.0
+        if varying:
+            alike[start] = float(np.abs(np.corrcoef(values.T)).min())
     if found:
-        most = max(alike.values())  # of an intensity beside them, colours differ more than among each other
-        found = [each for each in found if alike[each[-1]] > most / 2 or most < _ALIKE]
+        likest = max(alike.values())  # an intensity beside colours differs from them more than they do
+        if likest >= _ALIKE:
+            found = [each for each in found if alike[each[-1]] > likest / 2]
         start = min(found, key=lambda each: each[:2])[-1]
         names[start : start + 3] = ["red", "green", "blue"]
     elif count < 3 or count > 4:
@@ -167,7 +183,8 @@ def _pcd(path: Path) -> tuple[list[str], Float]:
     try:
         fields = head["FIELDS"]
         count = int(head["POINTS"][0])
-        shapes = zip(head["TYPE"], head["SIZE"], head.get("COUNT") or "1" * len(fields), strict=True)
+        counts = head.get("COUNT") or "1" * len(fields)
+        shapes = zip(head["TYPE"], head["SIZE"], counts, strict=True)
         rows = np.dtype(
             [(f"{i}", f"<{kind.lower()}{size}", (int(n),)) for i, (kind, size, n) in enumerate(shapes)]
         )
@@ -176,7 +193,9 @@ def _pcd(path: Path) -> tuple[list[str], Float]:
             table = np.zeros(len(values), rows)
             at = 0
             for name in rows.names or ():
-                table[name] = values[:, at : (at := at + table[name].shape[1])]
+                width = table[name].shape[1]
+                table[name] = values[:, at : at + width]
+                at += width
         elif how == "binary":
             table = np.frombuffer(body, rows, count)
         else:
@@ -194,6 +213,7 @@ def _pcd(path: Path) -> tuple[list[str], Float]:
             names += ["red", "green", "blue"]
             columns += unpack_colors(own[:, 0])
         else:
-            names += [*_names(field), *(f"{field}_{k}" for k in range(1, own.shape[1]))]
+            names += _names(field)
+            names += [f"{field}_{k}" for k in range(1, own.shape[1])]
             columns += list(own.T.astype(float))
     return names, np.column_stack(columns)

@@ -8,6 +8,7 @@ import re
 import struct
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from itertools import accumulate
 from pathlib import Path
 from typing import Any, NamedTuple, Self
 
@@ -73,8 +74,8 @@ def _numbered(folder: Path) -> list[Path]:
     """Return the models in the numbered folders of one, as COLMAP's mapper writes them."""
     if not folder.is_dir():
         return []
-    numbered = sorted((p for p in folder.iterdir() if p.name.isdecimal()), key=lambda p: int(p.name))
-    return [place for place in numbered if _tables(place)]
+    numbered = [place for place in folder.iterdir() if place.name.isdecimal() and _tables(place)]
+    return sorted(numbered, key=lambda place: int(place.name))
 
 
 def _count(folder: Path) -> int:
@@ -95,11 +96,13 @@ def _count(folder: Path) -> int:
 def models_below(path: Path) -> list[Path]:
     """Return the folders of models up to three levels below a folder, the nearest first."""
     level = [path]
-    found = []
+    found: list[Path] = []
     for _ in range(3):
-        inner = [sorted(p for p in folder.iterdir() if p.is_dir())[:_MOST_FOLDERS] for folder in level]
-        level = [folder for folders in inner for folder in folders][:_MOST_FOLDERS]
-        found += [folder for folder in level if _tables(folder)]
+        inner = []
+        for folder in level:
+            inner += sorted(filter(Path.is_dir, folder.iterdir()))[:_MOST_FOLDERS]
+        level = inner[:_MOST_FOLDERS]
+        found += filter(_tables, level)
     return found
 
 
@@ -135,7 +138,8 @@ def numbers_of(folder: Path, names: Sequence[str]) -> set[int]:
     if tables is None:
         return set()
     with parsing(tables[1]):
-        return {key for name, key, *_ in _images(open_table(tables[1], "image")) if name in wanted}
+        images = _images(open_table(tables[1], "image"))
+    return {key for name, key, *_ in images if name in wanted}
 
 
 _POINT_FILES = ("points3d.bin", "points3d.txt")
@@ -161,7 +165,10 @@ def incomplete(path: Path) -> InputError | None:
     """Return the error for a model without cameras or images, or None if there is no part of one."""
     folder = path.parent if path.is_file() else path
     above = [folder / "sparse", folder / "colmap" / "sparse"]
-    for place in (folder, *above, *(p for up in above if up.is_dir() for p in sorted(up.iterdir()))):
+    places = [folder, *above]
+    for up in filter(Path.is_dir, above):
+        places += sorted(up.iterdir())
+    for place in places:
         names = _held(place)
         held = [name for name in _MODEL_FILES if name.lower() in names]
         if held and _tables(place) is None:
@@ -194,11 +201,13 @@ def read(views: ViewFiles) -> Listed:
     path = views.path
     found = listed(views)
     beside = photos_beside(path)
-    others = [other for other in _models(beside[0] if beside else path) if other != found.path]
+    models = _models(beside[0] if beside else path)
+    others = [other for other in models if other != found.path]
     if not others:
         return found
     largest = max(others, key=_count)
-    text = f"read {found.path} of {len(others) + 1} models; {largest} has {plural(_count(largest), 'image')}"
+    images = plural(_count(largest), "image")
+    text = f"read {found.path} of {len(others) + 1} models; {largest} has {images}"
     return found.noted("other_models", len(others), text)
 
 
@@ -237,9 +246,12 @@ def listed(views: ViewFiles) -> Listed:
         else:
             pose = None
         in_rig = by_rig.get((key, number))
-        if in_rig is not None and (pose is None or not np.allclose(in_rig, pose, rtol=_SAME, atol=_SAME)):
-            stale += pose is not None
-            pose = in_rig
+        if in_rig is not None:
+            if pose is None:
+                pose = in_rig
+            elif not np.allclose(in_rig, pose, rtol=_SAME, atol=_SAME):
+                stale += 1
+                pose = in_rig
         if pose is None:
             if fault is None:
                 raise InputError(f"{name!r}: its quaternion is zero", path=tables[1])
@@ -314,8 +326,10 @@ class Table:
         try:
             values = layout.unpack_from(self.data, self._at)
         except struct.error:
-            ends = (self._at + struct.calcsize(layout.format[: k + 2]) for k in range(len(columns.names)))
-            raise self._cut_off(columns.names[sum(end <= len(self.data) for end in ends)]) from None
+            room = len(self.data) - self._at
+            formats = accumulate(layout.format[1:], initial="<")
+            whole = sum(struct.calcsize(start) <= room for start in formats) - 1
+            raise self._cut_off(columns.names[whole]) from None
         self._at += layout.size
         return values
 
@@ -354,8 +368,10 @@ class Table:
 
     def fault(self, names: Sequence[str], values: Sequence[float]) -> InputError | None:
         """Return what is wrong with the first of these values that is not finite."""
-        wrong = ((n, v) for n, v in zip(names, values, strict=True) if not math.isfinite(v))
-        return next((self.place(name).error(f"is {value}") for name, value in wrong), None)
+        for name, value in zip(names, values, strict=True):
+            if not math.isfinite(value):
+                return self.place(name).error(f"is {value}")
+        return None
 
     def _cut_off(self, name: str) -> InputError:
         return damaged("is cut off", path=self.path, property=name, index=self.row, item=self.item)
@@ -376,7 +392,8 @@ class TextTable(Table):
 
     def __iter__(self) -> Iterator[int]:
         while self._next < len(self._lines):
-            self.words = self._lines[self._next].split(maxsplit=_SPLITS.get(self.item, -1))
+            line = self._lines[self._next]
+            self.words = line.split(maxsplit=_SPLITS.get(self.item, -1))
             self._at = 0
             self._next += 1
             if self.words:
@@ -419,7 +436,8 @@ class TextTable(Table):
 
     def skip_points(self) -> None:
         """Move past the next line if it has the points of an image; it may be empty or missing."""
-        self._next += self._next < len(self._lines) and _is_points(self._lines[self._next])
+        if self._next < len(self._lines) and _is_points(self._lines[self._next]):
+            self._next += 1
 
 
 _NOT_FINITE = re.compile(r"[+-]?(nan(\(.*\))?|(?P<inf>inf(inity)?)|\d\.#\w+)", re.IGNORECASE)
@@ -429,9 +447,9 @@ _NOT_FINITE = re.compile(r"[+-]?(nan(\(.*\))?|(?P<inf>inf(inity)?)|\d\.#\w+)", r
 def _is_points(line: str) -> bool:
     """Return whether a line of images.txt has triples x, y, POINT3D_ID, unlike the line of an image."""
     words = line.split()
-    ids = words[2::3]
-    numbers = all(_NUMBER.fullmatch(word) or _NOT_FINITE.fullmatch(word) for word in words[:30])
-    return len(words) % 3 == 0 and all(map(_WHOLE.fullmatch, ids)) and numbers
+    if len(words) % 3 or not all(map(_WHOLE.fullmatch, words[2::3])):
+        return False
+    return all(_NUMBER.fullmatch(word) or _NOT_FINITE.fullmatch(word) for word in words[:30])
 
 
 _WHOLE = re.compile(r"-?\d+")
@@ -460,21 +478,23 @@ def _camera(model: str, size: tuple[int, int], p: tuple[float, ...]) -> Lens:
         if min(size) < 1 or min(lens.focal) <= 0:
             raise InputError(f"invalid camera of {size[0]:,}×{size[1]:,} pixels")
         return Lens.of(lens)
-    single_focal = model in ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
-    fx, fy, cx, cy, *k = (p[0], *p) if single_focal else p
+    if model in ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL"):  # one focal length
+        p = p[0], *p
+    fx, fy, cx, cy, *k = p
     if min(size) < 1 or min(fx, fy) <= 0:
-        raise InputError(f"invalid camera of {size[0]:,}×{size[1]:,} pixels and focal lengths {fx}, {fy}")
-    k1, k2, p1, p2 = (*k, 0.0, 0.0, 0.0, 0.0)[:4]
-    return Lens.pinhole(size, (fx, fy), (cx, cy), (k1, k2, p1, p2, 0.0))
+        width, height = size
+        raise InputError(f"invalid camera of {width:,}×{height:,} pixels and focal lengths {fx}, {fy}")
+    distortion = (*k, 0.0, 0.0, 0.0, 0.0, 0.0)[:5]
+    return Lens.pinhole(size, (fx, fy), (cx, cy), distortion)
 
 
 def _cameras(table: Table) -> dict[int, Lens | InputError]:
     cameras = {}
     for _ in table:
-        key, kind, *size = table.take(_CAMERA)
+        key, kind, width, height = table.take(_CAMERA)
         model, params = table.params(kind)
         fault = table.fault(_params(len(params)), params)
-        cameras[key] = fault or _camera(model, (size[0], size[1]), params)
+        cameras[key] = fault or _camera(model, (width, height), params)
     return cameras
 
 
@@ -552,8 +572,10 @@ def texts_of(cameras: Cameras) -> dict[str, str]:
         bent = [lens[key] for key in ("k1", "k2", "p1", "p2")]
         kind = ["OPENCV", *words, *bent] if any(bent) else ["PINHOLE", *words]
         camera = lenses.setdefault(" ".join(map(str, kind)), len(lenses) + 1)
-        pose = [*quaternion_of(viewmat[:3, :3]).tolist(), *viewmat[:3, 3].tolist()]
-        images.append(" ".join(map(str, [i + 1, *pose, camera, cameras.names[i]])) + "\n\n")
+        quat = quaternion_of(viewmat[:3, :3]).tolist()
+        shift = viewmat[:3, 3].tolist()
+        words = [i + 1, *quat, *shift, camera, cameras.names[i]]
+        images.append(" ".join(map(str, words)) + "\n\n")
     rows = {
         "cameras": "".join(f"{number} {words}\n" for words, number in lenses.items()),
         "images": "".join(images),

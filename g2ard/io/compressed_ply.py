@@ -67,28 +67,31 @@ class Stream(RawStream):
         bounds = _BOUNDS if "min_r" in chunk_properties else _BOUNDS[:12]  # older files: colours over [0, 1]
         require(chunk_properties, bounds, "a compressed scene", "chunk")
         rest = [p for p in header.properties("sh") if re.fullmatch(r"f_rest_\d+", p)]
-        if len(rest) not in (0, 9, 24, 45) or set(rest) != {f"f_rest_{k}" for k in range(len(rest))}:
+        if len(rest) not in (0, 9, 24, 45) or set(rest) != set(_rest_names(len(rest))):
             raise InputError(f"element 'sh' has {len(rest)} coefficients; expected 9, 24 or 45")
 
         names = ("vertex", "chunk", "sh") if rest else ("vertex", "chunk")
         vertex, chunk, *sh = read_element(path, header, *names)
-        if len(chunk) * _CHUNK_ROWS < len(vertex) or (sh and len(sh[0]) != len(vertex)):
-            raise InputError(f"{len(chunk)} chunks and {plural(len(vertex), 'Gaussian')} do not fit")
+        count = len(vertex)
+        if len(chunk) * _CHUNK_ROWS < count or (sh and len(sh[0]) != count):
+            raise InputError(f"{len(chunk)} chunks and {plural(count, 'Gaussian')} do not fit")
         for name in _PACKED:
             if vertex.dtype[name] != np.uint32:
                 raise InputError(f"has type {vertex.dtype[name]}, expected uint", property=name)
         offset = offset_of(header)
         mode = render_model_of(header.comments)
         model: RenderModel = "antialiased" if mode == "antialiased" else "classic"
-        super().__init__(path, len(vertex), len(rest) // 3, offset, render_model=model)
+        self._rest = len(rest) // 3
+        super().__init__(path, count, self._rest, offset, render_model=model)
         self.up = up_of(header.comments)
         self.restore(axes_of(header))
         self._vertex = vertex
         self._sh = sh[0] if sh else None
-        self._rest = len(rest) // 3
-        self._bounds = np.tile([[0.0] * 3, [1.0] * 3], (len(chunk), 3, 1, 1))
-        stored = structured_to_unstructured(np.asarray(chunk)[bounds]).reshape(len(chunk), -1, 2, 3)
-        self._bounds[:, : len(bounds) // 6] = stored
+        kinds = len(bounds) // 6
+        self._bounds = np.zeros((len(chunk), 3, 2, 3))
+        self._bounds[:, kinds:, 1] = 1
+        stored = structured_to_unstructured(np.asarray(chunk)[bounds])
+        self._bounds[:, :kinds] = stored.reshape(len(chunk), kinds, 2, 3)
 
     def raw(self, rows: int, start: int) -> Iterator[Raw]:
         bands: Iterator[Any] = repeat((0, None))
@@ -106,12 +109,14 @@ class Stream(RawStream):
         raw.log_scales[:] = _between(scales, first, _unpacked(scale, _VECTOR_BITS))
         others = (_unpacked(rotation, (10, 10, 10)) - 0.5) * np.sqrt(2)
         raw.quats[:] = from_smallest_three(rotation >> np.uint32(30), others)
-        color = _unpacked(color, (8, 8, 8, 8))
-        raw.sh0[:, 0] = (_between(colors, first, color[:, :3]) - 0.5) / SH_C0
-        raw.logit_opacities[:] = logits_of(color[:, 3])
+        rgba = _unpacked(color, (8, 8, 8, 8))
+        rgb = _between(colors, first, rgba[:, :3])
+        raw.sh0[:, 0] = (rgb - 0.5) / SH_C0
+        raw.logit_opacities[:] = logits_of(rgba[:, 3])
         if sh is not None:
-            codes = structured_to_unstructured(sh[[f"f_rest_{k}" for k in range(3 * self._rest)]])
-            raw.shN[:] = _coefficient(codes).reshape(len(sh), 3, -1).swapaxes(1, 2)
+            codes = structured_to_unstructured(sh[_rest_names(3 * self._rest)])
+            channels = _coefficient(codes).reshape(len(sh), 3, -1)
+            raw.shN[:] = channels.swapaxes(1, 2)
         return raw
 
 
@@ -125,7 +130,9 @@ def _between(bounds: Values, first: int, t: Float) -> Float:
 def _coefficient(codes: Values) -> Float:
     """Decode bytes to [−4, 4]: bucket centres, except that the first and last bucket are the ends."""
     t = (codes.astype(float) + 0.5) / 256
-    return (np.select([codes == 0, codes == 255], [0.0, 1.0], t) - 0.5) * 8
+    t[codes == 0] = 0
+    t[codes == 255] = 1
+    return (t - 0.5) * 8
 
 
 def write(path: Path, splats: Splats, *, overwrite: bool = False) -> float:
@@ -166,17 +173,21 @@ def write(path: Path, splats: Splats, *, overwrite: bool = False) -> float:
 def _within(values: Values) -> tuple[Float32, Float]:
     """Return the (chunks, 2, 3) bounds of the values of chunks, and values scaled to [0, 1] within them."""
     starts = np.arange(0, len(values), _CHUNK_ROWS)
-    ends = [limit.reduceat(values, starts).astype(np.float32) for limit in (np.minimum, np.maximum)]
-    low, high = (end.astype(float)[np.arange(len(values)) // _CHUNK_ROWS] for end in ends)
+    ends = np.stack([limit.reduceat(values, starts) for limit in (np.minimum, np.maximum)], axis=1)
+    ends = ends.astype(np.float32)
+    chunks = np.arange(len(values)) // _CHUNK_ROWS
+    low, high = ends[chunks].astype(float).swapaxes(0, 1)
     wide = high - low
-    return np.stack(ends, axis=1), (values - low) / np.where(wide > 0, wide, 1.0)
+    wide[wide == 0] = 1
+    return ends, (values - low) / wide
 
 
 def _packed(values: Float, bits: tuple[int, ...]) -> Values:
     """Pack (N, C) in [0, 1] into words, the first column in the highest bits."""
     word = np.zeros(len(values), np.uint32)
     for k, width in enumerate(bits):
-        word = word << np.uint32(width) | coded(values[:, k], (1 << width) - 1).astype(np.uint32)
+        part = coded(values[:, k], (1 << width) - 1)
+        word = word << np.uint32(width) | part.astype(np.uint32)
     return word
 
 
@@ -186,7 +197,8 @@ def _unpacked(words: Values, bits: tuple[int, ...]) -> Float:
     shift = 0
     for k, width in reversed(list(enumerate(bits))):
         top = (1 << width) - 1
-        values[:, k] = (words >> np.uint32(shift) & np.uint32(top)) / top
+        part = words >> np.uint32(shift) & np.uint32(top)
+        values[:, k] = part / top
         shift += width
     return values
 
@@ -194,6 +206,11 @@ def _unpacked(words: Values, bits: tuple[int, ...]) -> Float:
 def _harmonics(splats: Splats) -> Values:
     """Quantise coefficients in [−4, 4] to bytes, channel-major."""
     values = splats.shN.swapaxes(1, 2).reshape(len(splats), -1).astype(float)
-    codes = np.clip(np.floor((values / 8 + 0.5) * 256), 0, 255).astype(np.uint8)
-    names = [(f"f_rest_{k}", "u1") for k in range(codes.shape[1])]
+    buckets = np.floor((values / 8 + 0.5) * 256)
+    codes = np.clip(buckets, 0, 255).astype(np.uint8)
+    names = [(name, "u1") for name in _rest_names(codes.shape[1])]
     return unstructured_to_structured(codes, np.dtype(names))
+
+
+def _rest_names(count: int) -> list[str]:
+    return [f"f_rest_{k}" for k in range(count)]

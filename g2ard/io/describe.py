@@ -70,7 +70,9 @@ def bytes_of(path: Path) -> int:
     """Return the size on disk: only the chunks that are read of a SOG folder, only the scene of a run."""
     path = run_scene(path)
     folders = chunks_of(path) or [path]
-    files = [file for folder in folders for file in (folder.rglob("*") if folder.is_dir() else [folder])]
+    files = list[Path]()
+    for folder in folders:
+        files += folder.rglob("*") if folder.is_dir() else [folder]
     return sum(file.stat().st_size for file in files if file.is_file())
 
 
@@ -87,7 +89,8 @@ def _extent(positions: Values) -> dict[str, list[float]]:
 def _splats(splats: Splats) -> Json:
     scales = np.sort(splats.scales, axis=1)
     opacities = splats.opacities
-    unique = len(np.unique(np.ascontiguousarray(splats.means).view(f"V{3 * splats.means.itemsize}")))
+    means = np.ascontiguousarray(splats.means)
+    unique = len(np.unique(means.view(f"V{3 * means.itemsize}")))
     return {
         "count": len(splats),
         "sh_degree": splats.sh_degree,

@@ -210,8 +210,8 @@ def _check_content(path: Path) -> None:
         raise sign.error(path)
     named = _BY_NAME.get(suffix)
     fits = sign.reads == suffix or (named in _PACKED and named == _BY_NAME.get(sign.reads))
-    counts = suffix == ".bin" and path.name.lower() in _BY_NAME  # COLMAP's begin with a count, of any bytes
-    if not fits and not counts:
+    is_count = suffix == ".bin" and path.name.lower() in _BY_NAME  # COLMAP's first bytes are any
+    if not fits and not is_count:
         hint = f"rename it to {path.stem}{sign.reads}"
         raise InputError(f"is {sign.what} in spite of its name", hint=hint)
 
@@ -245,14 +245,15 @@ def run_views(path: AnyPath) -> Path:
 
 def run_background(path: AnyPath) -> Colour | None:
     """Return the background that a `distill` run in a folder was made with, or None."""
-    from g2ard.io.jsonfile import Place, Within1, checked, read_json
+    from g2ard.io.jsonfile import Json, Place, Within1, checked, read_json
 
     if run_scene(path) == Path(path):
         return None
     report = Path(path) / "report.json"
-    settings = checked(read_json(report).get("settings", {}), dict[str, Any], Place(report).to("settings"))
-    place = Place(report).to("settings", "recover.background")
-    return checked(settings.get("recover.background", BLACK), tuple[Within1, Within1, Within1], place)
+    place = Place(report).to("settings")
+    settings = checked(read_json(report).get("settings", {}), Json, place)
+    background = settings.get("recover.background", BLACK)
+    return checked(background, tuple[Within1, Within1, Within1], place.to("recover.background"))
 
 
 def holds(name: str, folder: Path) -> bool:
@@ -269,13 +270,15 @@ def json_format(content: Any) -> str | None:
     >>> json_format({"views": []}), json_format({"views": {"train": 40}})
     ('views', None)
     """
-    kind, sample = (list, next(iter(content), None)) if isinstance(content, list) else (dict, content)
+    sample = content
+    if isinstance(content, list):
+        sample = next(iter(content), None)
     fields = sample if isinstance(sample, dict) else {}
     keys = set(fields)
     if "format" not in keys and not isinstance(fields.get("views"), list):
         keys.discard("views")  # a number of views, say
     for name, (own, needed) in _JSON.items():
-        if own is kind and needed <= keys:
+        if isinstance(content, own) and needed <= keys:
             return name
     return None
 
@@ -313,7 +316,9 @@ def _cameras_of(own: Path) -> Iterator[Path]:
     import g2ard.io.nerfstudio_export as nerfstudio_export
 
     iteration = re.fullmatch(r"iteration_\d+", own.name) and own.parent.name == "point_cloud"
-    places = [own / inria.NAME, *([own.parent.parent / inria.NAME] if iteration else ())]
+    places = [own / inria.NAME]
+    if iteration:
+        places.append(own.parent.parent / inria.NAME)
     files = [file for file in places if file.is_file()]
     yield from (file for file in files if _format_in(file) == "inria")
     if (own / nerfstudio.NAME).is_file():
@@ -362,8 +367,9 @@ def clouds_in(folder: Path) -> list[Path]:
     """Return the clouds of a folder of clouds alone, by name; an empty list for another folder."""
     files = [file for file in sorted(folder.iterdir()) if not file.name.startswith(".")]
     clouds = [file for file in files if file.suffix.lower() in _CLOUDS]
-    others = [file for file in files if file.suffix.lower() not in (*_CLOUDS, *_BESIDE)]
-    return [] if others else clouds
+    if any(file.suffix.lower() not in (*_CLOUDS, *_BESIDE) for file in files):
+        return []
+    return clouds
 
 
 def _holds_clouds(folder: Path) -> bool:

@@ -9,7 +9,6 @@ from g2ard.arrays import Float, Values
 from g2ard.errors import InputError, damaged
 from g2ard.io.sanitize import Raw, cleaned
 from g2ard.io.types import Noted
-from g2ard.scene.splats import SH_C0
 
 _HEADER = 4096  # bytes of the file's header
 _SECTION = np.dtype(
@@ -97,9 +96,8 @@ def _rows(
     rows = np.frombuffer(data, row, count, begin)
     raw = Raw.empty(count, harmonics // 3)
     raw.means[:] = rows["mean"] if level == 0 else _centres(data, i, at, section, rows["mean"])
-    raw.set_linear(rows["scale"], rows["rgba"][:, 3] / 255)
+    raw.set_linear(rows["scale"], rows["rgba"])
     raw.quats[:] = rows["quat"]
-    raw.sh0[:, 0] = (rows["rgba"][:, :3] / 255 - 0.5) / SH_C0
     values = rows["sh"].astype(float)
     if level == 2:
         values = values / 255 * (limits[1] - limits[0]) + limits[0]

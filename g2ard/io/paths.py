@@ -37,9 +37,14 @@ def beside(photo: Path | None, place: Path) -> str | None:
         return real_path(photo).as_posix()
 
 
+def is_special(path: Path) -> bool:
+    """Return whether a path is a pipe, device or socket."""
+    return path.exists() and not (path.is_file() or path.is_dir())
+
+
 def check_regular(path: Path) -> None:
     """Raise an `InputError` for a pipe, device or socket, which might block forever."""
-    if path.exists() and not (path.is_file() or path.is_dir()):
+    if is_special(path):
         raise InputError("not a regular file", path=path)
 
 

@@ -13,7 +13,7 @@ from g2ard.config.choices import RenderModel
 from g2ard.errors import InputError
 from g2ard.io.types import Note, Noted
 from g2ard.progress import plural
-from g2ard.scene.splats import DRAWN_LOGIT, Splats
+from g2ard.scene.splats import DRAWN_LOGIT, SH_C0, Splats
 
 BLOCK = 8192
 """Rows per block: 2 MB for 60 float32 columns, which fits into the cache."""
@@ -58,11 +58,13 @@ class Raw:
         for own, values in zip(vars(self).values(), arrays, strict=True):
             own[tuple(map(slice, values.shape))] = values
 
-    def set_linear(self, scales: Values, alphas: Values) -> None:
-        """Store scales and opacities as logarithms and logits; rows of negative scales become NaN."""
+    def set_linear(self, scales: Values, rgba: Values) -> None:
+        """Store linear scales, and bytes of colours and opacity; rows of negative scales become NaN."""
+        shown = rgba / 255
+        self.sh0[:, 0] = (shown[:, :3] - 0.5) / SH_C0
         with np.errstate(divide="ignore", invalid="ignore"):
             self.log_scales[:] = np.log(scales.astype(float))
-            self.logit_opacities[:] = logits_of(alphas.astype(float))
+            self.logit_opacities[:] = logits_of(shown[:, 3])
 
     def activated(self, render_model: RenderModel, offset: Float, axis: _Up = None) -> Splats:
         """Return the scene, after `Tally.clean` has exponentiated `log_scales` in place."""
@@ -121,7 +123,7 @@ class Tally:
 
     def keep(self, positions: Values, colors: Values, noise: Mask) -> Mask:
         """Return an (n,) mask of the finite points that are not noise, and count all."""
-        good = np.all(np.isfinite(positions), axis=1) & np.all(np.isfinite(colors), axis=1)
+        good = _finite_rows(positions) & _finite_rows(colors)
         self._count(good)
         self.noise += int(np.count_nonzero(good & noise))
         good &= ~noise
@@ -150,13 +152,15 @@ class Tally:
         logits = raw.logit_opacities
         scales = raw.log_scales
         quats = raw.quats
-        good: Mask = ~np.isnan(logits) & ~(np.isnan(scales) | (scales == np.inf)).any(1)
+        huge = np.isnan(scales) | (scales == np.inf)  # a scale of −∞ is 0, and clamped
+        good: Mask = ~np.isnan(logits) & ~huge.any(1)
         for values in (raw.means, quats, raw.sh0, raw.shN):
             good &= _finite_rows(values)
 
         self.logits += int(np.count_nonzero(good & (np.abs(logits) > LOGIT_LIMIT)))
         np.clip(logits, -LOGIT_LIMIT, LOGIT_LIMIT, out=logits)
-        self.scales += int(np.count_nonzero(good[:, None] & (np.abs(scales) > LOG_SCALE_LIMIT)))
+        beyond = np.abs(scales) > LOG_SCALE_LIMIT
+        self.scales += int(np.count_nonzero(beyond[good]))
         np.clip(scales, -LOG_SCALE_LIMIT, LOG_SCALE_LIMIT, out=scales)
         scales[:] = np.exp(scales, dtype=float)
         zero = good & ~quats.any(1)
@@ -217,8 +221,7 @@ def logits_of(alphas: Values) -> Values:
 
 
 def _finite_rows(values: Values) -> Mask:
-    flat = values.reshape(len(values), -1)
-    finite = np.isfinite(flat)
+    finite = np.isfinite(values)
     if finite.all():
-        return np.ones(len(flat), bool)
-    return np.all(finite, axis=1)
+        return np.ones(len(values), bool)
+    return np.all(finite.reshape(len(values), -1), axis=1)

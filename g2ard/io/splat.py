@@ -12,7 +12,7 @@ from g2ard.io.packing import FAR_FROM_ORIGIN, as_bytes, as_packed
 from g2ard.io.plyfiles import row_blocks, spread_rows
 from g2ard.io.sanitize import Raw
 from g2ard.io.stream import RawStream
-from g2ard.scene.splats import SH_C0, Splats, unit_quats
+from g2ard.scene.splats import Splats, unit_quats
 from g2ard.scene.transform import restored
 
 _ROW = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
@@ -37,10 +37,13 @@ class Stream(RawStream):
             text = f"is not a complete .splat: {size:,} bytes are not a multiple of 32"
             raise damaged(text)
         rows = spread_rows(np.memmap(path, _ROW, "r"))
+        scales = rows["scale"]
         with np.errstate(invalid="ignore"):
-            right = np.isfinite(rows["mean"]).all(1) & ((rows["scale"] >= 0) & (rows["scale"] < _FAR)).all(1)
+            possible = (scales >= 0) & (scales < _FAR)
+        right = np.isfinite(rows["mean"]).all(1) & possible.all(1)
         right &= rows.view("u1").reshape(len(rows), -1).any(1)
-        words = bool(np.isin(np.frombuffer(rows[:_READ].tobytes(), "u1"), _TEXT).all())
+        start = np.frombuffer(rows[:_READ].tobytes(), "u1")
+        words = bool(np.isin(start, _TEXT).all())
         if words or right.mean() < _POSSIBLE:
             what = "text" if words else f"{1 - right.mean():.0%} of its rows are impossible"
             hint = "rename it to the suffix of its format, or export it again"
@@ -51,8 +54,7 @@ class Stream(RawStream):
         for _, block in row_blocks(self.path, np.memmap(self.path, _ROW, "r"), rows, start):
             raw = Raw.empty(len(block), 0)
             raw.means[:] = block["mean"]
-            raw.set_linear(block["scale"], block["rgba"][:, 3] / 255)
-            raw.sh0[:, 0] = (block["rgba"][:, :3] / 255 - 0.5) / SH_C0
+            raw.set_linear(block["scale"], block["rgba"])
             raw.quats[:] = (block["quat"].astype(np.float32) - 128) / 128
             yield raw
 
@@ -80,12 +82,10 @@ def write(path: Path, splats: Splats, *, overwrite: bool = False) -> float:
     It cannot state an `offset` or axes: see `form_of`. Return the largest change of a position by rounding.
     """
     form = form_of(splats)
-    exact = splats.positions
     again = restored(form, form.axes)
-    error = float(np.abs(again.positions - exact).max())
-    splats = form
-    weight = splats.scales.astype(float).prod(1) * splats.opacities
-    splats = splats.take(np.argsort(-weight, kind="stable"))
+    error = float(np.abs(again.positions - splats.positions).max())
+    weight = form.scales.astype(float).prod(1) * form.opacities
+    splats = form.take(np.argsort(-weight, kind="stable"))
     rows = np.empty(len(splats), _ROW)
     rows["mean"] = splats.means
     rows["scale"] = splats.scales
