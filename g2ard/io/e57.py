@@ -118,22 +118,24 @@ class _Scan(PointStream):
     def _sampled(self, color: Names) -> Iterator[MarkedPoints]:
         """Yield points from all parts of the scan."""
         self._color = color
-        every = slice(None, None, max(1, self.count // _SAMPLE_ROWS))
+        step = max(1, self.count // _SAMPLE_ROWS)
         for positions, colors, noise in self.raw(_SAMPLE_ROWS, 0):
-            yield positions[every], colors[every], noise[every]
+            yield positions[::step], colors[::step], noise[::step]
 
     def _marks(self) -> list[str]:
         """Return the fields that mark points without positions or colours."""
-        places = ("cartesianInvalidState", "sphericalInvalidState")
-        present = [name for name in places if name in self._names][:1]
-        return present + [mark for mark in _UNSEEN.get(self._color, ()) if mark in self._names]
+        marks = ["cartesianInvalidState", "sphericalInvalidState"]
+        if marks[0] in self._names:
+            del marks[1]
+        marks += _UNSEEN.get(self._color, ())
+        return [mark for mark in marks if mark in self._names]
 
     def raw(self, rows: int, start: int) -> Iterator[MarkedPoints]:
         """Yield points from a row on; those before are read too, since files cannot be searched."""
         from pye57 import libe57
 
         with _opened(self.path) as file:
-            names = dict.fromkeys((*self._place, *self._color, *self._marks(), *self.also))
+            names = (*self._place, *self._color, *self._marks(), *self.also)
             fields = {name: np.empty(rows) for name in names}
             buffers = libe57.VectorSourceDestBuffer()
             for name, values in fields.items():
@@ -152,14 +154,16 @@ class _Scan(PointStream):
 
     def _points(self, fields: dict[str, Float]) -> MarkedPoints:
         a, b, c = (fields[name] for name in self._place)
+        own = a, b, c
         if self._place == _SPHERICAL:  # range, azimuth, elevation
-            a, b, c = a * np.cos(c) * np.cos(b), a * np.cos(c) * np.sin(b), a * np.sin(c)
-        positions = np.stack([a, b, c], axis=1) @ self._rotation.T + self._translation
+            across = a * np.cos(c)
+            own = across * np.cos(b), across * np.sin(b), a * np.sin(c)
+        positions = np.stack(own, axis=1) @ self._rotation.T + self._translation
         names = self._color + self.also
         colors = np.zeros((len(positions), len(names)), np.float32)
         for channel, name in enumerate(names):
             colors[:, channel] = fields[name]
-        noise = (a == 0) & (b == 0) & (c == 0)  # relative to the scanner: no return
+        noise = ~np.any(own, axis=0)  # relative to the scanner: no return
         for name in self._marks():
             if name in _UNSEEN.get(self._color, ()):
                 colors[fields[name] != 0, : len(self._color)] = 0
@@ -174,11 +178,13 @@ def _limits(header: Any, name: str) -> tuple[float, float] | None:
     if limits not in header.scan_fields:
         return None
     try:
-        found = [float(header[limits][f"{name}{end}"].value()) for end in ("Minimum", "Maximum")]
+        stated = header[limits]
+        low = float(stated[f"{name}Minimum"].value())
+        high = float(stated[f"{name}Maximum"].value())
     except Exception:  # libe57's own, for a structure without them
         return None
-    if found[0] < found[1]:
-        return (found[0], found[1])
+    if low < high:
+        return low, high
     return None
 
 
@@ -215,8 +221,7 @@ def read(views: ViewFiles) -> Listed:
     defines. Others (for reference, cylindrical, without a pose) are left out with a note.
     """
     path = views.path
-    images = views.images
-    if images is not None:
+    if views.images is not None:
         raise InputError("has its photos inside", hint="leave {images} out")
     with _opened(path) as file:
         nodes = _images(file)
@@ -228,14 +233,16 @@ def read(views: ViewFiles) -> Listed:
     left_out = [reason for reason in found if isinstance(reason, str)]
     if not frames:
         raise InputError(f"none of its {plural(len(nodes), 'photo')} can be used: {left_out[0]}")
-    text = f"{plural(len(left_out), 'photo')} of {len(nodes)} left out: {left_out[0] if left_out else ''}"
+    first = left_out[0] if left_out else ""
+    text = f"{plural(len(left_out), 'photo')} of {len(nodes)} left out: {first}"
     return Listed(path, frames).noted("left_out_photos", len(left_out), text)
 
 
 def _frame(number: int, node: Any, folder: Path) -> Frame | str:
     """Return the view of a photo, or the reason why it cannot be used."""
     named = str(node["name"].value()) if node.isDefined("name") else ""
-    stem = "_".join(filter(None, [f"{number:04d}", _NO_NAME.sub("_", named).strip("_.")[:80]]))
+    plain = _NO_NAME.sub("_", named).strip("_.")[:80]
+    stem = f"{number:04d}_{plain}" if plain else f"{number:04d}"
     kind = next((k for k in ("spherical", "pinhole") if node.isDefined(f"{k}Representation")), None)
     if kind is None:
         return f"{stem} has no spherical or pinhole representation"
@@ -294,4 +301,5 @@ def _cache_of(path: Path) -> Path:
     """Return the folder of a file's photos below the user's cache folder; another file has another one."""
     state = path.stat()
     key = f"{path.resolve()}\n{state.st_size}\n{state.st_mtime_ns}"
-    return user_cache() / "e57" / f"{path.stem}-{hashlib.sha256(os.fsencode(key)).hexdigest()[:16]}"
+    digest = hashlib.sha256(os.fsencode(key)).hexdigest()
+    return user_cache() / "e57" / f"{path.stem}-{digest[:16]}"

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import re
 import unicodedata
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
+from itertools import chain
 from pathlib import Path, PureWindowsPath
 from typing import TYPE_CHECKING
 from urllib.parse import unquote
@@ -112,8 +113,7 @@ class Finder:
         for keys in _keys(parts[-1] if parts else ""):
             for end in ends:
                 for folder in self._folders:
-                    files = self._within(folder, end[:-1])
-                    if found := next((files[key] for key in keys if key in files), None):
+                    if found := _first(self._within(folder, end[:-1]), keys):
                         return found
         return None
 
@@ -126,10 +126,10 @@ class Finder:
         above, with the same folders in it; otherwise beside the photo."""
         spelled = [(place, path, _MASKS) for place, path in mask_folders(photo, depth)]
         for folder, path, names in [*spelled, (photo.parent, Path(photo.name), _MASKS_BESIDE)]:
-            files = self._within(folder, path.parts[:-1])
-            wanted = (f"stem {_folded(n.format(name=path.name, stem=path.stem))}" for n in names)
-            exact = f"exact {path.name}" if names is _MASKS else ""
-            if found := next((files[key] for key in (exact, *wanted) if key in files), None):
+            keys = [f"stem {_folded(name)}" for name in _mask_names(path, names)]
+            if names is _MASKS:
+                keys.insert(0, f"exact {path.name}")
+            if found := _first(self._within(folder, path.parts[:-1]), keys):
                 return found
         return None
 
@@ -137,7 +137,7 @@ class Finder:
         """Return the files by key of a folder below one."""
         for part in parts:
             inner = self._listed(folder)[1]
-            below = next((inner[key] for keys in _keys(part) for key in keys if key in inner), None)
+            below = _first(inner, chain.from_iterable(_keys(part)))
             if below is None:
                 return {}
             folder = below
@@ -150,23 +150,34 @@ class Finder:
             if folder.is_dir():
                 held = sorted(folder.iterdir(), reverse=True)
             held.sort(key=is_photo)  # those that can be read win over others of the same stem
-            levels = [(path, _keys(path.name)) for path in held if path.is_dir() or usable(path)]
+            levels = [(path, _keys(path.name)) for path in held if usable(path)]
             files: dict[str, Path] = {}
             for depth in (3, 2, 1, 0):  # nearer spellings win
                 for path, keys in levels:
-                    if not path.is_dir() and (depth < 2 or is_a_photo(path)):
+                    if depth < 2 or is_a_photo(path):
                         files |= dict.fromkeys(keys[depth], path)
-            inner = {key: path for path, keys in levels if path.is_dir() for keys_ in keys for key in keys_}
+            inner: dict[str, Path] = {}
+            for path in filter(Path.is_dir, held):
+                inner |= dict.fromkeys(chain.from_iterable(_keys(path.name)), path)
             self._listings[folder] = files, inner
         return self._listings[folder]
+
+
+def _first(files: Mapping[str, Path], keys: Iterable[str]) -> Path | None:
+    """Return the file of the first key that there is."""
+    return next((files[key] for key in keys if key in files), None)
+
+
+def _mask_names(photo: Path, patterns: Sequence[str]) -> list[str]:
+    return [pattern.format(name=photo.name, stem=photo.stem) for pattern in patterns]
 
 
 def _keys(name: str) -> list[list[str]]:
     """Return what a file may be found by, the strictest first."""
     folded = _folded(name)
-    others = [_folded(_stem(other)) for other in _respelled(name)]
     stem = f"stem {_folded(_stem(name))}"
-    return [[f"exact {name}"], [f"name {folded}"], [stem], [f"other {other}" for other in others]]
+    others = [f"other {_folded(_stem(other))}" for other in _respelled(name)]
+    return [[f"exact {name}"], [f"name {folded}"], [stem], others]
 
 
 def _stem(name: str) -> str:
@@ -213,8 +224,11 @@ def readable(names: Sequence[str], files: Sequence[Path | None]) -> list[str]:
         return list(names)
 
     def agreeing(spelled: Sequence[str]) -> int:
-        own = zip(spelled, files, strict=True)
-        return sum(p is not None and _folded(s).endswith(_folded(p.name)) for s, p in own)
+        count = 0
+        for name, file in zip(spelled, files, strict=True):
+            if file is not None and _folded(name).endswith(_folded(file.name)):
+                count += 1
+        return count
 
     data = [name.encode("utf-8", "surrogateescape") for name in names]
     best = [raw.decode("utf-8", "backslashreplace") for raw in data]
@@ -239,7 +253,9 @@ def usable(path: Path) -> bool:
 def files_in(folder: Path, *suffixes: str) -> list[Path]:
     """Return the usable files of a folder, sorted; none if it does not exist."""
     held = sorted(folder.iterdir()) if folder.is_dir() else []
-    return [path for path in held if (not suffixes or path.suffix.lower() in suffixes) and usable(path)]
+    if suffixes:
+        held = [path for path in held if path.suffix.lower() in suffixes]
+    return list(filter(usable, held))
 
 
 def photos_in(folder: Path, *, below: bool = False) -> list[Path]:
@@ -249,7 +265,7 @@ def photos_in(folder: Path, *, below: bool = False) -> list[Path]:
     else:
         files = files_in(folder)
     photos = [file for file in files if is_photo(file)]
-    masks = {p.with_name(m.format(name=p.name, stem=p.stem)) for p in photos for m in _MASKS_BESIDE}
+    masks = {photo.with_name(name) for photo in photos for name in _mask_names(photo, _MASKS_BESIDE)}
     return [photo for photo in photos if photo.with_name(photo.stem) not in masks]
 
 
@@ -280,9 +296,13 @@ def plain_parts(name: str) -> list[str]:
 def is_end(name: str, photo: Path) -> bool:
     """Return whether a photo's path ends in all parts of `name`, whatever the spelling and suffix."""
     parts = plain_parts(name)
-    pairs = zip(reversed(parts), reversed(photo.parts), strict=False)
-    alike = [any(not set(a).isdisjoint(b) for a, b in zip(*map(_keys, pair), strict=True)) for pair in pairs]
-    return len(alike) == len(parts) and all(alike)
+    own = photo.parts[len(photo.parts) - len(parts) :]
+    return len(parts) <= len(photo.parts) and all(map(_are_alike, parts, own))
+
+
+def _are_alike(name: str, other: str) -> bool:
+    """Return whether two names may be of one file."""
+    return any(not set(a).isdisjoint(b) for a, b in zip(_keys(name), _keys(other), strict=True))
 
 
 def mask_folders(photo: Path, depth: int) -> list[tuple[Path, Path]]:
@@ -293,11 +313,11 @@ def mask_folders(photo: Path, depth: int) -> list[tuple[Path, Path]]:
     found = []
     for own in photo.parents[: max(1, depth)]:
         size = own.name.partition("_")[2]  # images_4 goes with masks_4
-        names = [f"{name}_{size}" for name in _MASK_FOLDERS if size] + list(_MASK_FOLDERS)
-        names += [f"{own.name}_{name}" for name in _MASK_FOLDERS]
-        if own.is_dir():
-            beside = {_folded(p.name): p for p in own.parent.iterdir() if p.is_dir()}
-        else:
-            beside = {}
-        found += [(beside[key], photo.relative_to(own)) for name in names if (key := _folded(name)) in beside]
+        if not own.is_dir():
+            continue
+        names = [f"{name}_{size}" for name in _MASK_FOLDERS if size]
+        names += [*_MASK_FOLDERS, *(f"{own.name}_{name}" for name in _MASK_FOLDERS)]
+        beside = {_folded(p.name): p for p in own.parent.iterdir() if p.is_dir()}
+        folders = [beside[key] for key in map(_folded, names) if key in beside]
+        found += [(folder, photo.relative_to(own)) for folder in folders]
     return found

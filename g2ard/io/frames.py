@@ -51,6 +51,11 @@ class Lens(NamedTuple):
     photo: PhotoLens | None = None
     made: bool = False
 
+    @property
+    def is_bent(self) -> bool:
+        """Whether views are to be made from the photo."""
+        return self.photo is not None and not self.made
+
     def at(self, size: Size) -> Lens:
         """Return the lens for resized photos."""
         if size == self.size:
@@ -70,8 +75,9 @@ class Lens(NamedTuple):
     ) -> Lens:
         """Return the lens of focal lengths and a principal point, None for the middle of the image."""
         fx, fy = focal
-        cx, cy = (size[0] / 2, size[1] / 2) if middle is None else middle
-        return cls(size, np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], float), distortion)
+        cx, cy = middle or (size[0] / 2, size[1] / 2)
+        K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], float)
+        return cls(size, K, distortion)
 
     @classmethod
     def of(cls, photo: PhotoLens) -> Lens:
@@ -131,7 +137,9 @@ def _fit_lens_to_photo(lens: Lens, photo: Path) -> tuple[Lens, bool]:
         else:
             size = image.size
         is_turned = orientation(image) != 1
-        return (lens if lens.made or not have_same_aspect(size, lens.size) else lens.at(size)), is_turned
+        if not lens.made and have_same_aspect(size, lens.size):
+            lens = lens.at(size)
+        return lens, is_turned
     return lens, False
 
 
@@ -142,9 +150,10 @@ def make_rigid(matrix: Float, place: Place) -> Float:
     """
     if matrix.shape not in ((4, 4), (3, 4)) or not np.isfinite(matrix).all():
         raise place.error("is not a finite 4×4 matrix")
-    U, s, Vt = np.linalg.svd(matrix[:3, :3])
+    U, scales, Vt = np.linalg.svd(matrix[:3, :3])
+    largest, _, least = scales
     R = U @ Vt
-    if not s[0] > 0 or s[2] < 0.99 * s[0] or np.linalg.det(R) < 0:
+    if not largest > 0 or least < 0.99 * largest or np.linalg.det(R) < 0:
         raise place.error("is not a rotation and a translation")
     out = np.eye(4)
     out[:3, :3] = R
@@ -171,15 +180,13 @@ def invert_pose(matrix: Float) -> Float:
 
 def _stack_cameras(path: Path, frames: Sequence[Frame]) -> Cameras:
     masks = Finder()
+    rows = []
+    for frame in frames:
+        lens = frame.lens
+        row = frame.viewmat, lens.K, lens.size, frame.name, frame.photo, lens.distortion
+        rows.append((*row, _find_mask(frame, masks), frame.kind, lens.photo))
     try:
-        rows = (
-            (
-                *(f.viewmat, f.lens.K, f.lens.size, f.name, f.photo),
-                *(f.lens.distortion, _find_mask(f, masks), f.kind, f.lens.photo),
-            )
-            for f in frames
-        )
-        return Cameras.from_lists(*map(list, zip(*rows, strict=True)))
+        return Cameras.from_lists(*zip(*rows, strict=True))
     except InputError as error:
         raise error.at(path=path) from error
     except OverflowError as error:
@@ -212,7 +219,8 @@ def make_view_set(listed: Listed) -> ViewSet:
         notes.append(Note("not_finite", len(left_out), f"{text} (view {name!r})"))
     frames, found_notes = _check_photos(frames)
     notes += found_notes
-    if bent := [frame for frame in frames if frame.lens.photo is not None and not frame.lens.made]:
+    bent = [frame for frame in frames if frame.lens.is_bent]
+    if bent:
         frames = [view for frame in frames for view in _split_into_pinholes(frame)]
         models = ", ".join(sorted({frame.lens.photo.model for frame in bent if frame.lens.photo}))
         made = sum(frame.lens.photo is not None for frame in frames)
@@ -247,10 +255,11 @@ def make_view_set(listed: Listed) -> ViewSet:
 def _split_into_pinholes(frame: Frame) -> list[Frame]:
     """Return the pinhole views of a frame, which is its only one unless its lens needs several."""
     lens = frame.lens.photo
-    if lens is None or frame.lens.made:
+    if lens is None or not frame.lens.is_bent:
         return [frame]
     views = []
-    for face, turn, K, size in lens.faces(frame.lens.size[0] / lens.size[0]):
+    scale = frame.lens.size[0] / lens.size[0]
+    for face, turn, K, size in lens.faces(scale):
         viewmat = np.eye(4)
         viewmat[:3] = turn.T @ frame.viewmat[:3]
         name = f"{frame.name}#{face}" if face else frame.name

@@ -49,14 +49,14 @@ class _View(msgspec.Struct):
 def read(given: ViewFiles) -> Listed:
     """Read views; photo paths are relative to the file unless `images`, a folder of photos, is given."""
     path = given.path
-    images = given.images
     content = read_own(path, _FORMAT, _VERSION).get("views", [])
     views = checked(content, list[_View], Place(path).to("views"), entries="view")
     if not views:
         raise InputError("no views found ('views' is empty)", path=path)
-    finder = Finder(images or path.parent)
+    finder = Finder(given.images or path.parent)
     masks = Finder(path.parent)
-    return Listed(path, [_frame(Place(path, i, "view"), view, finder, masks) for i, view in enumerate(views)])
+    frames = [_frame(Place(path, i, "view"), view, finder, masks) for i, view in enumerate(views)]
+    return Listed(path, frames)
 
 
 def _frame(place: Place, view: _View, finder: Finder, masks: Finder) -> Frame:
@@ -86,7 +86,7 @@ def _photo_lens(lens: _PhotoLens | None, place: Place) -> PhotoLens | None:
     if PARAMETERS.get(lens.model) != len(lens.params) or min(lens.size) < 1:
         raise place.to("lens").error(f"is not a lens of the model {lens.model!r}")
     turn = tuple(np.array(lens.turn).ravel().tolist())
-    return PhotoLens(lens.model, (lens.size[0], lens.size[1]), tuple(lens.params), turn)
+    return PhotoLens(lens.model, lens.size, tuple(lens.params), turn)
 
 
 def _exact(stored: Float, place: Place) -> Float:
@@ -133,6 +133,7 @@ def text_of(path: Path, cameras: Cameras, splits: Splits, weights: ArrayLike | N
             "weight": drawn[i],
             "kind": None if cameras.kinds[i] == USUAL else cameras.kinds[i],
         }
-        lines.append(json.dumps({key: value for key, value in view.items() if value is not None}))
+        stated = {key: value for key, value in view.items() if value is not None}
+        lines.append(json.dumps(stated))
     head = f'{{"format": "{_FORMAT}", "version": {_VERSION}, "views": [\n'
     return head + ",\n".join(lines) + "\n]}\n"

@@ -19,7 +19,7 @@ def holds(folder: Path) -> bool:
 
 def data_of(path: Path) -> Path | None:
     """Return the folder of a run's data, or None if it does not exist."""
-    file = path / NAME if path.is_dir() else path
+    file = ViewFiles(path).file(NAME)
     named = read_settings(file).path("data_dir")
     if named is None:
         return None
@@ -33,9 +33,7 @@ def read(views: ViewFiles) -> Listed:
     principal axes, whose signs depend on the linear algebra library, and do not store the transform. Without
     `images`, photos are in the data's `images_N` for `data_factor` N, or `images`.
     """
-    path = views.path
-    images = views.images
-    file = path / NAME if path.is_dir() else path
+    file = views.file(NAME)
     settings = read_settings(file)
     if settings.word("data_type") not in (None, "colmap"):
         raise InputError(
@@ -48,12 +46,12 @@ def read(views: ViewFiles) -> Listed:
             hint="train with --no-normalize-world-space, or give cameras in the scene's world",
         )
     named = settings.path("data_dir")
-    data = data_of(path)
+    data = data_of(file)
     if named is None or data is None:
         text = f"data_dir {named and named.as_posix()} does not exist"
         raise InputError(text, path=file, hint="give its COLMAP folder as views, or correct data_dir")
     smaller = data / f"images_{settings.word('data_factor')}"
-    photos = images or (smaller if smaller.is_dir() else None)
+    photos = views.images or (smaller if smaller.is_dir() else None)
     try:
         found = colmap.listed(ViewFiles(data, photos))
         frames = found.whole()
@@ -62,7 +60,8 @@ def read(views: ViewFiles) -> Listed:
     every = settings.word("test_every") or "8"
     if not every.isdigit() or int(every) < 1:
         raise InputError(f"is {every!r}, expected a whole number ≥ 1", path=file, property="test_every")
-    words = ["train" if i % int(every) else "test" for i in range(len(frames))]
-    split = Listed(found.path, [f._replace(split=word) for f, word in zip(frames, words, strict=True)])
+    frames = [frame._replace(split="train" if i % int(every) else "test") for i, frame in enumerate(frames)]
     text = "the run optimised its poses; these are the poses before training"
-    return split.noted("optimised_poses", len(frames) * (settings.word("pose_opt") == "true"), text)
+    return Listed(found.path, frames).noted(
+        "optimised_poses", len(frames) * (settings.word("pose_opt") == "true"), text
+    )

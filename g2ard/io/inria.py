@@ -35,19 +35,21 @@ def read(views: ViewFiles) -> Listed:
     as in INRIA's trainer. The id is appended to repeated names, such as r_0 of each split of NeRF's synthetic
     scenes. Without `images`, photos are in `images` beside the file.
     """
-    path = views.path
     images = views.images
-    file = path / NAME if path.is_dir() else path
+    file = views.file(NAME)
     listed = checked(read_any_json(file), list[_Camera], Place(file), entries="camera")
     beside = images or file.parent / "images"
     names = [camera.img_name for camera in listed]
     among = Finder.among(images, names, [beside], [file.parent])
     finder = among if beside.is_dir() or among.notes else None
-    frames = [_frame(Place(file, i, "camera"), camera, finder) for i, camera in enumerate(listed)]
-    times = Counter(frame.name for frame in frames)
-    for i, frame in enumerate(frames):
-        if times[frame.name] > 1:
-            frames[i] = frame._replace(name=f"{frame.name}_{i if listed[i].id is None else listed[i].id}")
+    times = Counter(names)
+    frames = []
+    for i, camera in enumerate(listed):
+        frame = _frame(Place(file, i, "camera"), camera, finder)
+        if times[camera.img_name] > 1:
+            number = i if camera.id is None else camera.id
+            frame = frame._replace(name=f"{frame.name}_{number}")
+        frames.append(frame)
     repeated = sum(count for count in times.values() if count > 1)
     text = f"{plural(repeated, 'camera')} of {len(frames)} have repeated names; their ids are appended"
     return Listed(file, frames, notes=among.notes).noted("repeated_names", repeated, text)

@@ -27,8 +27,7 @@ def read(views: ViewFiles) -> Listed:
     `path` is the file or its folder. Photos lie in `images`, or in `images_4` or the like if that is missing,
     and may be smaller than the stated size.
     """
-    path = views.path
-    file = path / NAME if path.is_dir() else path
+    file = views.file(NAME)
     try:
         rows = np.load(
             file, mmap_mode="r", allow_pickle=False

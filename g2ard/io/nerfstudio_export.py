@@ -39,11 +39,10 @@ def read(views: ViewFiles) -> Listed:
     model above the photos, scaled to the photos' size.
     """
     path = views.path
-    images = views.images
     files = exported(path) if path.is_dir() else [path]
     lenses: dict[Path, dict[str, Lens]] = {}
     frames = []
-    finder = Finder(images) if images else None
+    finder = Finder(views.images) if views.images else None
     for file in files:
         listed = checked(read_any_json(file), list[_Camera], Place(file), entries="camera")
         frames += [

@@ -40,22 +40,22 @@ def read(views: ViewFiles) -> Listed:
     """Read the keyframes of a capture: fx, fy, cx, cy, width, height, and rows t_00 … t_23 of
     world_from_camera in OpenGL axes, metres, y up.
     """
-    path = views.path
-    images = views.images
-    folders = cameras_in(path)
+    folders = cameras_in(views.path)
     if folders is None:
         raise InputError("has no keyframes/cameras with .json files")
     cameras, photos = folders
     files = sorted(files_in(cameras, ".json"), key=lambda file: (len(file.stem), file.stem))
-    finder = Finder(images or photos)
+    finder = Finder(views.images or photos)
     text = "the capture has no corrected_cameras; these are ARKit's poses as tracked"
     tracked = 0 if cameras.name == "corrected_cameras" else len(files)
-    return Listed(path, [_frame(file, finder) for file in files]).noted("tracked_poses", tracked, text)
+    frames = [_frame(file, finder) for file in files]
+    return Listed(views.path, frames).noted("tracked_poses", tracked, text)
 
 
 def _frame(file: Path, finder: Finder) -> Frame:
     place = Place(file)
-    *pose, fx, fy, cx, cy, width, height = msgspec.structs.astuple(checked(read_json(file), _Keyframe, place))
+    keyframe = checked(read_json(file), _Keyframe, place)
+    *pose, fx, fy, cx, cy, width, height = msgspec.structs.astuple(keyframe)
     if not (fx > 0 and fy > 0 and min(width, height) > 0):
         raise place.error(f"has focal lengths {fx}, {fy} and {width}×{height} pixels")
     name = f"{file.stem}.jpg"

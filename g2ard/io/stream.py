@@ -90,13 +90,19 @@ class Stream(ABC, Generic[Block]):
 
     def __getstate__(self) -> dict[str, Any]:
         """Return what another process needs to read rows; it maps files that are mapped here."""
-        state = {name: value for name, value in vars(self).items() if name not in ("sample", "_reading")}
-        maps = {name: value for name, value in state.items() if isinstance(value, np.memmap)}
-        return state | {n: _Mapped(m.filename, m.dtype, m.offset, m.shape) for n, m in maps.items()}
+        state = vars(self).copy()
+        state.pop("sample", None)
+        state.pop("_reading", None)
+        for name, rows in state.items():
+            if isinstance(rows, np.memmap):
+                state[name] = _Mapped(rows.filename, rows.dtype, rows.offset, rows.shape)
+        return state
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        maps = {name: value for name, value in state.items() if isinstance(value, _Mapped)}
-        vars(self).update(state | {n: np.memmap(m.file, m.dtype, "r", *m[2:]) for n, m in maps.items()})
+        vars(self).update(state)
+        for name, rows in state.items():
+            if isinstance(rows, _Mapped):
+                setattr(self, name, np.memmap(rows.file, rows.dtype, "r", rows.offset, rows.shape))
         self._is_copy = True
 
     def absolute(self) -> Self:
@@ -330,12 +336,16 @@ class PointStream(Stream[RawPoints]):
         positions, values, noise = sample
         good = np.isfinite(positions).all(axis=1) & ~noise
         placed = good & positions.any(axis=1)
-        low, high = np.percentile(positions[placed], (1, 99), axis=0) if placed.any() else np.zeros((2, 3))
+        low, high = np.zeros((2, 3))
+        if placed.any():
+            low, high = np.percentile(positions[placed], (1, 99), axis=0)
         middle = (low + high) / 2
         extent = high - low
-        far = np.isfinite(middle).all() and (np.abs(middle) > np.linalg.norm(extent)).any()
+        size = np.linalg.norm(extent)
+        farthest = np.abs(middle).max()
+        far = np.isfinite(middle).all() and farthest > size
         zeros = int(np.count_nonzero(good & ~placed))
-        away = bool((np.abs(middle) > _FAR * np.linalg.norm(extent)).any() and extent.any())
+        away = bool(farthest > _FAR * size and extent.any())
         self._zeros_are_lost = away or zeros > max(_FEW_BLACK, _BLACK_SHARE * len(good))
         if self._zeros_are_lost and placed.any():
             good = placed
@@ -415,7 +425,9 @@ class PointStream(Stream[RawPoints]):
     def blocks(self, rows: int, start: int = 0) -> Iterator[RawPoints]:
         for positions, values, noise in self.marked(rows, start):
             good = self.tally.keep(positions, values, noise)
-            positions, values = (positions, values) if good.all() else (positions[good], values[good])
+            if not good.all():
+                positions = positions[good]
+                values = values[good]
             colors = self.shown(values)
             self.tally.black += int(np.count_nonzero(colors.max(axis=1, initial=0) < _BLACK))
             yield positions, colors
@@ -452,7 +464,8 @@ class HeldPoints(PointStream):
 
     def raw(self, rows: int, start: int) -> Iterator[MarkedPoints]:
         positions, values, noise = self._held
-        values = np.column_stack([values, *map(self._columns.__getitem__, self.also)]).astype(np.float32)
+        further = [self._columns[name] for name in self.also]
+        values = np.column_stack([values, *further]).astype(np.float32)
         for first in range(start, self.count, rows):
             part = slice(first, first + rows)
             yield positions[part], values[part], noise[part]
@@ -469,8 +482,9 @@ _DEGREES = Note(
 def _in_degrees(middle: Float, extent: Float) -> bool:
     """Return whether x and y may be degrees, z metres: far from 0, and of much smaller extent than z."""
     wide = float(extent[:2].max())
-    on_globe = (np.abs(middle[:2]) <= 180).all() and np.abs(middle[:2]).min() <= 90
-    return bool(on_globe and np.abs(middle[:2]).max() > _FAR * wide and extent[2] > _STEEP * wide)
+    low, high = sorted(np.abs(middle[:2]))
+    on_globe = low <= 90 and high <= 180
+    return bool(on_globe and high > _FAR * wide and extent[2] > _STEEP * wide)
 
 
 class Joined(Stream[Block]):
@@ -495,7 +509,13 @@ class Joined(Stream[Block]):
         ]
 
     def header_notes(self) -> Notes:
-        return tuple(replace(n, text=f"{s.path}: {n.text}") for s in self.streams for n in s.header_notes())
+        notes = []
+        for stream in self.streams:
+            notes += [replace(note, text=f"{stream.path}: {note}") for note in stream.header_notes()]
+        return tuple(notes)
+
+    def _from(self, start: int) -> Iterator[tuple[int, int]]:
+        return from_row([stream.count for stream in self.streams], start)
 
 
 class JoinedScenes(Joined[Splats], SceneStream):
@@ -514,13 +534,13 @@ class JoinedScenes(Joined[Splats], SceneStream):
         self.axes = common_axes([stream.axes for stream in streams])
 
     def positions(self, rows: int, start: int = 0) -> Iterator[Float32]:
-        for number, begin in from_row([stream.count for stream in self.streams], start):
+        for number, begin in self._from(start):
             stream = self.streams[number]
             for means in stream.positions(rows, begin):
                 yield self._moved(means, stream.offset)
 
     def blocks(self, rows: int, start: int = 0) -> Iterator[Splats]:
-        for number, begin in from_row([stream.count for stream in self.streams], start):
+        for number, begin in self._from(start):
             stream = self.streams[number]
             stream.tally = self.tally
             for block in stream.blocks(rows, begin):
@@ -546,8 +566,10 @@ class JoinedClouds(Joined[RawPoints], PointStream):
     def __init__(self, streams: Sequence[PointStream]) -> None:
         self.streams = streams
         at = np.concatenate([stream.sample for stream in streams])
-        sample = at, np.zeros((len(at), 0), np.float32), np.zeros(len(at), bool)
-        PointStream.__init__(self, streams[0].path, sum(s.count for s in streams), sample)
+        bare = np.zeros((len(at), 0), np.float32)
+        sample = at, bare, np.zeros(len(at), bool)
+        count = sum(stream.count for stream in streams)
+        PointStream.__init__(self, streams[0].path, count, sample)
         self.channels = max(stream.channels for stream in streams)
         self.lack = streams[0].lack
         if len({stream.axes for stream in streams}) == 1:
@@ -573,11 +595,11 @@ class JoinedClouds(Joined[RawPoints], PointStream):
         return [tally for stream in self.streams for tally in stream.tallies()]
 
     def raw(self, rows: int, start: int) -> Iterator[MarkedPoints]:
-        for number, begin in from_row([stream.count for stream in self.streams], start):
+        for number, begin in self._from(start):
             yield from self.streams[number].marked(rows, begin)
 
     def blocks(self, rows: int, start: int = 0) -> Iterator[RawPoints]:
-        for number, begin in from_row([stream.count for stream in self.streams], start):
+        for number, begin in self._from(start):
             stream = self.streams[number]
             for tally in stream.tallies():
                 tally.clear()
@@ -593,14 +615,18 @@ def joined_clouds(streams: Sequence[PointStream]) -> PointStream:
 
 def _far_apart(streams: Sequence[PointStream]) -> Iterator[Note]:
     """Yield a note if clouds lie so far apart that they may be in several map systems."""
-    boxes = [(s.path.name, *np.percentile(s.sample, (1, 99), axis=0)) for s in streams if len(s.sample)]
-    for number, (name, low, high) in enumerate(boxes):
-        others = [box for i, box in enumerate(boxes) if i != number]
-        gaps = [np.maximum(low - box[2], box[1] - high).max() for box in others]
-        size = max(float((box[2] - box[1]).max()) for box in boxes)
-        if gaps and min(gaps) > _APART * size > 0:
-            text = f"{name} lies {min(gaps):,.0f} units from the others, perhaps in another coordinate system"
-            yield Note("map_systems", 1, text)
+    placed = [stream for stream in streams if len(stream.sample)]
+    if len(placed) < 2:
+        return
+    boxes = np.array([np.percentile(stream.sample, (1, 99), axis=0) for stream in placed])
+    lows, highs = boxes.swapaxes(0, 1)
+    size = (highs - lows).max()
+    for number, stream in enumerate(placed):
+        gaps = np.maximum(lows[number] - highs, lows - highs[number]).max(axis=1)
+        nearest = np.delete(gaps, number).min()
+        if nearest > _APART * size > 0:
+            text = f"{stream.path.name} lies {nearest:,.0f} units from the others, "
+            yield Note("map_systems", 1, f"{text}perhaps in another coordinate system")
             return
 
 

@@ -111,6 +111,10 @@ class ViewFiles:
     def __str__(self) -> str:
         return str(self.path)
 
+    def file(self, name: str) -> Path:
+        """Return the file of this name in the folder of views, or the file of views."""
+        return self.path / name if self.path.is_dir() else self.path
+
 
 @dataclass(frozen=True, eq=False)
 class ViewSet:
