@@ -135,7 +135,8 @@ def spz_glb(splats: Splats, centre: Float | None = None) -> tuple[list[bytes], f
     splats = splats.take(packing_order(splats.means))
     means = (splats.means.astype(float) - centre) * (-1, 1, -1)
     blob = spz.encoded(_about_y(splats), means, bits, _SPZ_VERSION)
-    stored = np.rint(means * (1, -1, -1) * (1 << bits)) / (1 << bits)
+    steps = 1 << bits
+    stored = np.rint(means * (1, -1, -1) * steps) / steps
     ends = {end: getattr(stored, end)(axis=0).tolist() for end in ("min", "max")}
     names = {"POSITION": "VEC3", "COLOR_0": "VEC4"}
     names |= {f"{EXTENSION}:SCALE": "VEC3", f"{EXTENSION}:ROTATION": "VEC4"}
@@ -199,8 +200,12 @@ def _attributes(splats: Splats) -> dict[str, Values]:
         f"{EXTENSION}:OPACITY": alphas,
         f"{EXTENSION}:SH_DEGREE_0_COEF_0": splats.sh0[:, 0],
     }
-    out |= {name: splats.shN[:, k] * _SH_FLIPS[k] for name, k in _harmonics(splats.sh_degree)}
-    return {name: v.astype("<f4") if v.dtype.kind == "f" else v for name, v in out.items()}
+    for name, k in _harmonics(splats.sh_degree):
+        out[name] = splats.shN[:, k] * _SH_FLIPS[k]
+    for name, values in out.items():
+        if values.dtype.kind == "f":
+            out[name] = values.astype("<f4")
+    return out
 
 
 def _harmonics(degree: int) -> list[tuple[str, int]]:
@@ -435,7 +440,8 @@ def _primitive(within: Place, document: _Document, binary: bytes, primitive: _Pr
         place = within.to("extensions", name)
         packed = checked(inside.extensions[name], _Compressed, place)
         view = _view(document, packed.buffer_view, place, "the SPZ")
-        scene, own = spz.decoded(path, binary[view.byte_offset : view.byte_offset + view.byte_length])
+        start = view.byte_offset
+        scene, own = spz.decoded(path, binary[start : start + view.byte_length])
         scene = _about_y(scene)
     return scene, (*notes, *own)
 
@@ -453,7 +459,7 @@ def _attributes_of(place: Place, document: _Document, binary: bytes, names: Json
     own = list(names)
     base = f"{EXTENSION}:SH_DEGREE_0_COEF_0"
     opacity = f"{EXTENSION}:OPACITY"
-    names = {f"{EXTENSION}:{name[1:]}" if name.startswith("_") else name: at for name, at in names.items()}
+    names = {re.sub("^_", f"{EXTENSION}:", name): at for name, at in names.items()}
     degree = max(d for d in range(4) if d == 0 or f"{EXTENSION}:SH_DEGREE_{d}_COEF_0" in names)
     means = values("POSITION", 3)
     raw = Raw.empty(len(means), (degree + 1) ** 2 - 1)
@@ -470,7 +476,8 @@ def _attributes_of(place: Place, document: _Document, binary: bytes, names: Json
         notes.append(Note("first_draft", len(means), text))
     with np.errstate(invalid="ignore"):  # a signalling NaN
         raw.means[:] = means * _GLTF_TURN
-        raw.quats[:] = values(f"{EXTENSION}:ROTATION", 4)[:, [3, 0, 1, 2]] * (1, *_GLTF_TURN)
+        quats = values(f"{EXTENSION}:ROTATION", 4)[:, [3, 0, 1, 2]]
+        raw.quats[:] = quats * (1, *_GLTF_TURN)
         for name, k in _harmonics(degree):
             raw.shN[:, k] = values(name, 3) * _SH_FLIPS[k]
     return cleaned(raw, notes)
@@ -506,13 +513,14 @@ def _accessor(place: Place, document: _Document, binary: bytes, index: int, name
     start = view.byte_offset + accessor.byte_offset
     if step < row:
         raise InputError(f"attribute {name!r} has a stride of {step} bytes, less than its elements")
-    if accessor.count and start + step * (accessor.count - 1) + row > len(binary):
+    count = accessor.count
+    if count and start + step * (count - 1) + row > len(binary):
         raise damaged(f"truncated: attribute {name!r} ends past the file")
-    rows = np.ndarray((accessor.count, width), dtype, binary, start, (step, dtype.itemsize))
+    rows = np.ndarray((count, width), dtype, binary, start, (step, dtype.itemsize))
+    values = rows.astype(np.float32)
     if not accessor.normalized:
-        return rows.astype(np.float32)
-    top = np.iinfo(dtype).max
-    return np.maximum(rows.astype(np.float32) / np.float32(top), np.float32(-1))
+        return values
+    return np.maximum(values / np.float32(np.iinfo(dtype).max), np.float32(-1))
 
 
 def _nodes_shown(path: Path, document: _Document) -> set[int]:
@@ -522,13 +530,15 @@ def _nodes_shown(path: Path, document: _Document) -> set[int]:
         return every
     ahead = list(_entry(document.scenes, document.scene, Place(path).to("scene")).nodes)
     found = set()
+    place = Place(path).to("scenes", document.scene, "nodes")
     while ahead:
-        if (at := ahead.pop()) not in found:
-            ahead += _entry(document.nodes, at, Place(path).to("scenes", document.scene, "nodes")).children
+        at = ahead.pop()
+        if at not in found:
+            ahead += _entry(document.nodes, at, place).children
             found.add(int(at))
-    splats = {i for i, mesh in enumerate(document.meshes) if any(map(_has_splats, mesh.primitives))}
-    if any(document.nodes[at].mesh in splats for at in found):
-        return found
+    for index, mesh in enumerate(document.meshes):
+        if any(map(_has_splats, mesh.primitives)) and any(document.nodes[at].mesh == index for at in found):
+            return found
     return every
 
 
@@ -555,7 +565,8 @@ def _placements(path: Path, nodes: list[_Node], mesh: int, seen: set[int]) -> li
                 at = parents.get(at)
         if not np.isfinite(total[:3, 3]).all():
             raise InputError(f"invalid translation {tuple(total[:3, 3].tolist())}")
-        found.append(total * np.outer((*_GLTF_TURN, 1), (*_GLTF_TURN, 1)))
+        turn = (*_GLTF_TURN, 1)
+        found.append(total * np.outer(turn, turn))
     if holders:
         return found
     return [np.eye(4)]

@@ -61,8 +61,10 @@ def split_mask(views: Views, names: Sequence[str], which: str, *, stated: Splits
 
 def states_splits(views: Views, stated: Splits = ()) -> bool:
     """Return whether splits are stated by views or by a split.json beside them, see `split_mask`."""
-    read = _read_split, _read_apart
-    return any(stated) or (views is not None and any(of(Path(views)) is not None for of in read))
+    if any(stated) or views is None:
+        return any(stated)
+    path = Path(views)
+    return _read_split(path) is not None or _read_apart(path) is not None
 
 
 def splits_of(views: Views, names: Sequence[str], stated: Splits = ()) -> tuple[str | None, ...]:
@@ -74,8 +76,11 @@ def splits_of(views: Views, names: Sequence[str], stated: Splits = ()) -> tuple[
     ('train', 'test', 'train')
     """
     masks = _masks(views, names, stated)
-    order = sorted(masks, key=lambda word: (word != "test", word != "train", word))
-    return tuple(next((word for word in order if masks[word][i]), None) for i in range(len(names)))
+    splits: list[str | None] = [None] * len(names)
+    for word in sorted(masks, key=lambda word: (word != "test", word != "train", word), reverse=True):
+        for i in np.flatnonzero(masks[word]):
+            splits[i] = word
+    return tuple(splits)
 
 
 def for_training(views: Views, names: Sequence[str], stated: Splits = ()) -> Mask:
@@ -103,7 +108,8 @@ def for_scores(views: Views, names: Sequence[str], stated: Splits = ()) -> Mask:
 def _masks(views: Views, names: Sequence[str], stated: Splits) -> dict[str, Mask]:
     """Return split → (C,) mask: as stated, as listed in split.json, or by the rule."""
     if any(stated):
-        return {word: np.array([s == word for s in stated], bool) for word in {s for s in stated if s}}
+        words = {word for word in stated if word}
+        return {word: np.array([own == word for own in stated], bool) for word in words}
     listed = None if views is None else _read_split(Path(views))
     if listed is None and views is not None and (apart := _read_apart(Path(views))):
         split, wanted = apart
@@ -185,10 +191,13 @@ def not_held_out(cameras: Cameras, held_out: Cameras) -> Mask:
     their pose."""
     alike = same_photos(cameras.image_paths, held_out.image_paths, copies=True)
     places = np.concatenate([cameras.positions, held_out.positions])
-    slack = _SAME_POSE * np.ptp(places, axis=0).max() + np.finfo(float).eps * np.abs(places).max()
+    rounding = np.finfo(float).eps * np.abs(places).max()
+    slack = _SAME_POSE * np.ptp(places, axis=0).max() + rounding
+    turns = cameras.viewmats[:, :3, :3]
     for place, turn in zip(held_out.positions, held_out.viewmats[:, :3, :3], strict=True):
-        near = (np.abs(cameras.positions - place) <= slack).all(1)
-        alike |= near & (np.abs(cameras.viewmats[:, :3, :3] - turn) <= _SAME_POSE).all((1, 2))
+        near = np.abs(cameras.positions - place) <= slack
+        parallel = np.abs(turns - turn) <= _SAME_POSE
+        alike |= near.all(1) & parallel.all((1, 2))
     return ~alike
 
 

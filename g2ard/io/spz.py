@@ -42,7 +42,7 @@ _COORDINATE_SYSTEM = 0xADBE0003
 _OWN_PLACE = 0x67320001
 """Record of version 4 with `own_place` as JSON, which older versions have in their gzip header's comment."""
 
-_COMMENTED = 0x10  # flag of a gzip header with a comment
+_COMMENTED = b"\x10"  # flag of a gzip header with a comment
 _HEADER_4 = 32  # size of the header of version 4, bytes
 
 _ADOBE_AXES: tuple[Axes, ...] = (
@@ -74,7 +74,7 @@ def names_axes(path: Path) -> bool:
     data = path.read_bytes()
     if b'"stored"' in _comment(data):
         return True
-    if len(data) < _HEADER_4 or data[:4] != _MAGIC or data[4] != 4 or not data[14] & _HAS_EXTENSIONS:
+    if len(data) < _HEADER_4 or data[:5] != _MAGIC + b"\4" or not data[14] & _HAS_EXTENSIONS:
         return False
     with about(path):
         return _extensions(data)[0] != "RUB"
@@ -96,13 +96,16 @@ def decoded(path: Path, data: bytes) -> Noted:
 
     kept = min(stored, 15)
     raw = Raw.empty(count, kept)
-    raw.means[:] = _fixed24(positions.reshape(-1, 3)).reshape(-1, 3) / (1 << fraction_bits) * (1, -1, -1)
+    steps = _fixed24(positions.reshape(-1, 3)).reshape(-1, 3)
+    raw.means[:] = steps / (1 << fraction_bits) * (1, -1, -1)
     raw.log_scales[:] = scales.reshape(-1, 3) / 16 - 10
-    raw.quats[:] = (_quats_xyz if version == 2 else _quats_packed)(rotations) * (1, 1, -1, -1)
+    quats = _quats_xyz(rotations) if version == 2 else _quats_packed(rotations)
+    raw.quats[:] = quats * (1, 1, -1, -1)
     raw.logit_opacities[:] = logits_of(alphas / 255)
-    raw.sh0[:, 0] = (colors.reshape(-1, 3) / 255 - 0.5) / _COLOR_SCALE
-    bands = sh.reshape(count, stored, 3)[:, :kept]
-    raw.shN[:] = (bands.astype(np.float32) - 128) / 128 * FLIPS[:kept, None]
+    shades = colors.reshape(-1, 3) / 255
+    raw.sh0[:, 0] = (shades - 0.5) / _COLOR_SCALE
+    bands = sh.reshape(count, stored, 3)[:, :kept].astype(np.float32)
+    raw.shN[:] = (bands - 128) / 128 * FLIPS[:kept, None]
     notes = []
     if stored > kept:
         notes.append(Note("ignored_bands", 1, "spherical harmonics past degree 3 ignored"))
@@ -142,8 +145,7 @@ def _in_place(path: Path, scene: Splats, own: bytes) -> Splats:
 
 def _comment(data: bytes) -> bytes:
     """Return the comment of a gzip header whose only optional part it is."""
-    commented = data[:3] == b"\x1f\x8b\x08" and data[3:4] == bytes([_COMMENTED])
-    if not commented:
+    if data[:4] != b"\x1f\x8b\x08" + _COMMENTED:
         return b""
     return data[10 : data.find(b"\0", 10)]
 
@@ -200,7 +202,7 @@ def _sizes(head: bytes) -> list[int]:
     if fraction_bits > _POSITION_BITS:
         raise InputError(f"is {fraction_bits}, expected at most {_POSITION_BITS}", property="fractionalBits")
     rotation = 3 if version == 2 else 4
-    return [9 * count, count, 3 * count, 3 * count, rotation * count, 3 * _COEFFICIENTS[degree] * count]
+    return [count * size for size in (9, 1, 3, 3, rotation, 3 * _COEFFICIENTS[degree])]
 
 
 def _slices(data: bytes, sizes: list[int]) -> list[bytes]:
@@ -325,8 +327,9 @@ def write(
 
 def rounding(means: Values, bits: int) -> float:
     """Return the largest change of a coordinate in `bits` fractional bits."""
-    scaled = np.asarray(means, float) * (1 << bits)
-    return float(np.abs(np.rint(scaled) - scaled).max()) / (1 << bits)
+    steps = 1 << bits
+    scaled = np.asarray(means, float) * steps
+    return float(np.abs(np.rint(scaled) - scaled).max()) / steps
 
 
 def encoded(
@@ -361,8 +364,9 @@ def encoded(
         progress("pack", number, len(streams))
         packed.append(zstd.compress(stream, 19))
     progress("pack", len(streams), len(streams))
-    sizes = zip(packed, streams, strict=True)
-    table = b"".join(struct.pack("<QQ", len(p), len(stream)) for p, stream in sizes)
+    table = b""
+    for frame, stream in zip(packed, streams, strict=True):
+        table += struct.pack("<QQ", len(frame), len(stream))
     start = struct.pack("<BI12x", len(streams), _HEADER_4 + len(records))
     return head + start + records + table + b"".join(packed)
 
@@ -378,7 +382,8 @@ def _gzipped(content: bytes, progress: Progress, comment: bytes) -> bytes:
     packed = b"".join([*parts, packer.flush()])
     if not comment:
         return packed
-    return packed[:3] + bytes([_COMMENTED]) + packed[4:10] + comment + b"\0" + packed[10:]
+    head = packed[:3] + _COMMENTED + packed[4:10]
+    return head + comment + b"\0" + packed[10:]
 
 
 def check_far(splats: Splats, means: Float, widened: float = 1.0, movable: bool = False) -> None:
@@ -400,7 +405,8 @@ def fraction_bits(means: Float, splats: Splats, *, movable: bool = False) -> int
     reach = np.abs(means).max(axis=1)
     farthest = float(reach.max())
     # 23 bits beside the sign; the margin keeps what is just below a power of two from rounding up to 2^23
-    room = 23 - math.ceil(math.log2(max(farthest, 2.0**-20) * (1 + 2**-20)))
+    margin = 1 + 2**-20
+    room = 23 - math.ceil(math.log2(max(farthest, 2.0**-20) * margin))
     middle = np.sort(splats.scales, axis=1)[:, 1].astype(float)
     fine_scale = max(float(np.percentile(middle, 1)), 1e-12)
     bits_for_fine_scale = math.ceil(-math.log2(fine_scale / 4))
@@ -412,7 +418,8 @@ def fraction_bits(means: Float, splats: Splats, *, movable: bool = False) -> int
         away = np.abs(means - np.median(means, axis=0)).max(axis=1)
     else:
         away = reach
-    far = np.flatnonzero(away * (1 + 2**-20) > 2.0 ** (23 - max(0, math.ceil(-math.log2(coarsest)))))
+    least_bits = max(0, math.ceil(-math.log2(coarsest)))
+    far = np.flatnonzero(away * margin > 2.0 ** (23 - least_bits))
     steps = f"(steps of {2.0**-bits:g})"
     if 2 * len(far) > len(means):
         raise InputError(
@@ -430,7 +437,8 @@ def fraction_bits(means: Float, splats: Splats, *, movable: bool = False) -> int
 
 
 def _streams(splats: Splats, means: Float, bits: int, version: int) -> list[bytes]:
-    fixed = np.rint(means * (1, -1, -1) * (1 << bits)).astype("<i4")
+    steps = means * (1, -1, -1) * (1 << bits)
+    fixed = np.rint(steps).astype("<i4")
     quats = packing.unit_quats(splats.quats) * (1, 1, -1, -1)
     signs = np.where(quats[:, :1] < 0, -1, 1)  # w ≥ 0
     streams = [
@@ -453,9 +461,9 @@ def _bytes(values: Values) -> bytes:
 def _packed(quats: Float) -> bytes:
     largest, others = packing.smallest_three(quats[:, [1, 2, 3, 0]])
     words = largest.astype(np.uint32)
-    for k in range(3):
-        part = (others[:, k] < 0).astype(np.uint32) << 9 | packing.coded(
-            np.abs(others[:, k]) * math.sqrt(2), 511
-        ).astype(np.uint32)
+    for values in others.T:
+        negative = (values < 0).astype(np.uint32)
+        magnitude = packing.coded(np.abs(values) * math.sqrt(2), 511)
+        part = negative << 9 | magnitude.astype(np.uint32)
         words = (words << np.uint32(10) | part).astype(np.uint32)
     return words.astype("<u4").tobytes()
