@@ -26,9 +26,11 @@ def resize(image: Float32, size: Size) -> Float32:
             image = _average(image, length, axis)
     height, width = image.shape[:2]
     if (width, height) != size:
-        planes = [Image.fromarray(np.ascontiguousarray(image[..., c])) for c in range(image.shape[2])]
-        grown = [np.asarray(plane.resize(size, Image.Resampling.BILINEAR), np.float32) for plane in planes]
-        image = np.stack(grown, axis=2)
+        channels = []
+        for values in np.moveaxis(image, 2, 0):
+            plane = Image.fromarray(np.ascontiguousarray(values))
+            channels.append(np.asarray(plane.resize(size, Image.Resampling.BILINEAR), np.float32))
+        image = np.stack(channels, axis=2)
     return np.ascontiguousarray(image)
 
 
@@ -42,7 +44,8 @@ def _average(image: Float32, length: int, axis: int) -> Float32:
     share = np.expand_dims(edges - below, [i for i in range(3) if i != axis])
     low = sums.take(below, axis)
     high = sums.take(below + 1, axis)
-    return (np.diff(low + share * (high - low), axis=axis) * (length / count)).astype(np.float32)
+    means = np.diff(low + share * (high - low), axis=axis) * (length / count)
+    return means.astype(np.float32)
 
 
 def to_bytes(image: ArrayLike) -> Bytes:
@@ -54,7 +57,8 @@ def to_bytes(image: ArrayLike) -> Bytes:
     values = np.asarray(image)
     if values.dtype == np.uint8:
         return values
-    return np.rint(np.clip(np.nan_to_num(values, nan=0.0), 0, 1) * 255).astype(np.uint8)
+    inside = np.clip(np.nan_to_num(values, nan=0.0), 0, 1)
+    return np.rint(inside * 255).astype(np.uint8)
 
 
 def as_saved(image: ArrayLike) -> Float32:
@@ -71,7 +75,8 @@ def write_png(path: str | Path, image: ArrayLike, *, overwrite: bool = False) ->
     values = to_bytes(image)
     if values.ndim == 3 and values.shape[2] == 1:
         values = values[..., 0]
-    if not values.size or not (values.ndim == 2 or (values.ndim == 3 and values.shape[2] in (3, 4))):
+    channels = values.shape[2:]
+    if not values.size or values.ndim < 2 or channels not in ((), (3,), (4,)):
         raise InputError(f"expected an image, got an array of shape {values.shape}", path=path)
     with atomic_output(path, overwrite) as temporary:
         temporary.write_bytes(png_bytes(values))

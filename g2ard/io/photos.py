@@ -64,7 +64,7 @@ def _load_image(cameras: Cameras, index: int) -> Float32:
         named = None
     else:
         named = f"{cameras.source} names it as view {name!r}"
-    target = int(cameras.widths[index]), int(cameras.heights[index])
+    target = _size_of(cameras, index)
     lens = _lens_of(cameras, index)
     size = target if lens is None else lens.size
     try:
@@ -93,8 +93,12 @@ def _lens_of(cameras: Cameras, index: int) -> PhotoLens | None:
     if cameras.lenses[index] is not None or not any((k1, k2, p1, p2, k3)):
         return cameras.lenses[index]
     (fx, _, cx), (_, fy, cy), _ = cameras.Ks[index].tolist()
-    size = int(cameras.widths[index]), int(cameras.heights[index])
-    return PhotoLens("FULL_OPENCV", size, (fx, fy, cx, cy, k1, k2, p1, p2, k3, 0.0, 0.0, 0.0))
+    params = fx, fy, cx, cy, k1, k2, p1, p2, k3, 0.0, 0.0, 0.0
+    return PhotoLens("FULL_OPENCV", _size_of(cameras, index), params)
+
+
+def _size_of(cameras: Cameras, index: int) -> Size:
+    return int(cameras.widths[index]), int(cameras.heights[index])
 
 
 @dataclass(frozen=True)
@@ -127,12 +131,13 @@ def measure_traits(files: Sequence[Path]) -> PhotoTraits:
             shown.append(decode_photo(files[i]))
     if not any(image.shape[2] == 4 and image[..., 3].min() < 1 for image in shown):
         alpha = 0
-    edges = [np.concatenate([image[0], image[-1], image[:, 0], image[:, -1]])[:, :3] for image in shown]
-    if alpha or not edges:
+    if alpha or not shown:
         return PhotoTraits(alpha, None, sizes)
-    border = np.concatenate(edges)
+    sides = [side[:, :3] for image in shown for side in (image[0], image[-1], image[:, 0], image[:, -1])]
+    border = np.concatenate(sides)
     colour = np.median(border, axis=0)
-    same = (np.abs(border - colour).max(1) <= _BORDER_COLOUR_SLACK).mean() >= _BORDER_SHARE
+    away = np.abs(border - colour).max(1)
+    same = (away <= _BORDER_COLOUR_SLACK).mean() >= _BORDER_SHARE
     red, green, blue = colour.tolist()
     return PhotoTraits(0, (red, green, blue) if same else None, sizes)
 
@@ -186,9 +191,11 @@ def _find_held(cameras: Cameras, index: int) -> Mask | None:
     lens = _lens_of(cameras, index)
     if photo is None or lens is None:
         return None
-    size = int(cameras.widths[index]), int(cameras.heights[index])
-    times = _samples_per_side(lens, read_size(photo, cameras.source, lens.size)[0], cameras.Ks[index])
-    samples = _look_up(lens, cameras.Ks[index], size, times)[1]
+    K = cameras.Ks[index]
+    size = _size_of(cameras, index)
+    width, _ = read_size(photo, cameras.source, lens.size)
+    times = _samples_per_side(lens, width, K)
+    _, samples = _look_up(lens, K, size, times)
     whole: Mask = np.all(samples.reshape(size[1], times, size[0], times), axis=(1, 3))
     return None if whole.all() else whole
 
@@ -207,8 +214,10 @@ def _sample(image: Float32, u: Float, v: Float, around: bool = False) -> Float32
     above = np.floor(v).astype(int)
     right = (u - left)[:, None].astype(np.float32)
     down = (v - above)[:, None].astype(np.float32)
+    first = left % width
+    second = (left + 1) % width
     top, bottom = (
-        image[row, left % width] * (1 - right) + image[row, (left + 1) % width] * right
+        image[row, first] * (1 - right) + image[row, second] * right
         for row in (above, np.minimum(above + 1, height - 1))
     )
     return np.asarray(top * (1 - down) + bottom * down)
@@ -234,11 +243,13 @@ def _resample(image: Float32, lens: PhotoLens, K: Float, size: Size) -> Float32:
     times = _samples_per_side(lens, width, K)
     scale = np.array([width, height]) / lens.size
     bands = []
-    for pixels in _bands(_look_up(lens, K, size, times)[0].reshape(size[1], -1, 2)):
+    places, _ = _look_up(lens, K, size, times)
+    for pixels in _bands(places.reshape(size[1], -1, 2)):
         u, v = (pixels.reshape(-1, 2) * scale - 0.5).T
         samples = _sample(image, u, v, around=lens.model == "EQUIRECTANGULAR")
         rows = len(pixels)
-        bands.append(resize(samples.reshape(rows * times, size[0] * times, -1), (size[0], rows)))
+        fine = samples.reshape(rows * times, size[0] * times, -1)
+        bands.append(resize(fine, (size[0], rows)))
     return np.concatenate(bands)
 
 
@@ -269,7 +280,8 @@ def _find_pixels(lens: PhotoLens, K: tuple[float, ...], size: Size, times: int) 
     bands = []
     for band in _bands(down):
         u, v = (grid.ravel() for grid in np.meshgrid(across, band))
-        bands.append(lens.project(np.stack([u, v, np.ones(u.size)], 1) @ turn))
+        rays = np.stack([u, v, np.ones(u.size)], 1)
+        bands.append(lens.project(rays @ turn))
     pixels, held = zip(*bands, strict=True)
     return np.concatenate(pixels), np.concatenate(held)
 

@@ -20,7 +20,7 @@ import numpy as np
 from msgspec import UNSET, UnsetType
 from PIL.Image import Image
 
-from g2ard.arrays import Bytes, Float32, Values
+from g2ard.arrays import Bytes, Float32, Rows, Values
 from g2ard.config.choices import Axes, RenderModel
 from g2ard.errors import InputError, damaged
 from g2ard.io.jsonfile import FileName, Place, Vector, Whole, checked, parse_json, read_json
@@ -178,9 +178,10 @@ class _Chunk:
 
     def means(self, count: int) -> Float32:
         """Decode only the (count, 3) means."""
-        low, high = (self.rows(name, count) for name in self.meta.means.files[:2])
+        part = self.meta.means
+        low, high = (self.rows(name, count) for name in part.files[:2])
         means = np.empty((count, 3), np.float32)
-        _fill_means(means, low, high, _positions(self.meta.means))
+        _fill_means(means, low, high, _positions(part))
         return means
 
 
@@ -196,8 +197,11 @@ class _Decoder:
     def __init__(self, chunk: _Chunk, count: int) -> None:
         meta = chunk.meta
         self.chunk = chunk
-        names = [*meta.means.files[:2], meta.quats.files[0], meta.scales.files[0], meta.sh0.files[0]]
-        self._low, self._high, self._quats, self._scales, self._base = (chunk.rows(n, count) for n in names)
+        self._low = chunk.rows(meta.means.files[0], count)
+        self._high = chunk.rows(meta.means.files[1], count)
+        self._quats = chunk.rows(meta.quats.files[0], count)
+        self._scales = chunk.rows(meta.scales.files[0], count)
+        self._base = chunk.rows(meta.sh0.files[0], count)
         self._positions = _positions(meta.means)
         self._log_scales = _values(chunk.file.to("scales"), meta.scales)
         self._colors = _values(chunk.file.to("sh0"), meta.sh0)
@@ -211,7 +215,8 @@ class _Decoder:
         """Decode the Gaussians `rows` into `raw` in blocks that fit into the cache."""
         for start in range(rows.start, rows.stop, BLOCK):
             stop = min(start + BLOCK, rows.stop)
-            self._fill(slice(start, stop), raw.take(slice(start - rows.start, stop - rows.start)))
+            part = raw.take(slice(start - rows.start, stop - rows.start))
+            self._fill(slice(start, stop), part)
 
     def _fill(self, rows: slice, raw: Raw) -> None:
         _fill_means(raw.means, self._low[rows], self._high[rows], self._positions)
@@ -225,7 +230,7 @@ class _Decoder:
 
     def _fill_rest(self, rows: slice, out: Float32) -> None:
         """Look up palette entries by label."""
-        index = self._labels[rows, 0] + (self._labels[rows, 1].astype(np.intp) << 8)
+        index = _words(self._labels[rows, 0], self._labels[rows, 1])
         if index.max() >= len(self._palette):
             row = int(np.argmax(index >= len(self._palette)))
             raise InputError(
@@ -240,14 +245,21 @@ class _Decoder:
 def _fill_means(out: Float32, low: Bytes, high: Bytes, positions: Values) -> None:
     """Decode positions from 16-bit codes, a byte from each of two images."""
     for axis in range(3):
-        out[:, axis] = positions[axis][low[:, axis] + (high[:, axis].astype(int) << 8)]
+        codes = _words(low[:, axis], high[:, axis])
+        out[:, axis] = positions[axis][codes]
+
+
+def _words(low: Bytes, high: Bytes) -> Rows:
+    """Return the 16-bit numbers of low and high bytes."""
+    return low + (high.astype(np.intp) << 8)
 
 
 def _positions(part: _Means) -> Values:
     """Return the (3, 65536) values of codes per axis, which are stored as sign(x)·ln(|x| + 1)."""
-    low, high = (np.broadcast_to(np.atleast_1d(bound)[:3], 3) for bound in (part.mins, part.maxs))
-    logs = low + (high - low) * (np.arange(65536)[:, None] / 65535)
-    return (np.sign(logs) * np.expm1(np.abs(logs))).T.astype(np.float32)
+    low, high = (np.atleast_1d(bound)[:3, None] for bound in (part.mins, part.maxs))
+    logs = low + (high - low) * (np.arange(65536) / 65535)
+    values = np.sign(logs) * np.expm1(np.abs(logs))
+    return np.broadcast_to(values, (3, 65536)).astype(np.float32)
 
 
 def _logits(place: Place, part: _Part) -> Values:
@@ -280,7 +292,8 @@ def _values(place: Place, part: _Part) -> Callable[[Bytes], Values]:
     table = book.astype(np.float32)
 
     def looked_up(codes: Bytes) -> Values:
-        if len(table) < 256 and codes.size and (top := int(codes.max())) >= len(table):
+        top = int(codes.max(initial=0))
+        if codes.size and top >= len(table):
             raise place.error(f"has {len(table)} numbers, expected at least {top + 1}")
         return table[codes]
 
@@ -292,7 +305,8 @@ def _quats(codes: Bytes) -> Values:
 
     Other fourth bytes give a zero quaternion, which later becomes the identity, with a note.
     """
-    quats = from_smallest_three(codes[:, 3] & 3, (codes[:, :3] / 255 - 0.5) * np.sqrt(2))
+    others = (codes[:, :3] / 255 - 0.5) * np.sqrt(2)
+    quats = from_smallest_three(codes[:, 3] & 3, others)
     quats[codes[:, 3] < 252] = 0
     return quats
 
@@ -306,8 +320,8 @@ def _palette(chunk: _Chunk, part: _Rest, rest: int, count: int) -> tuple[Float32
             f"has width {image.shape[1]}, expected {_PALETTE_COLUMNS * rest}", path=chunk.place / centroids
         )
     values = _values(chunk.file.to("shN"), part)
-    palette = values(image[:, :, :3].reshape(-1, rest, 3)).astype(np.float32)
-    return palette, chunk.rows(labels, count)
+    entries = image[:, :, :3].reshape(-1, rest, 3)
+    return values(entries).astype(np.float32), chunk.rows(labels, count)
 
 
 _CHUNK_NAME = re.compile(r"(\d+)_(\d+)")
@@ -343,9 +357,9 @@ def chunks_of(path: Path) -> list[Path]:
     named = [(folder, match) for folder in folders if (match := _CHUNK_NAME.fullmatch(folder.name))]
     if not named:
         return folders
-    finest = min(int(match[1]) for _, match in named)
-    numbered = sorted((int(match[2]), folder) for folder, match in named if int(match[1]) == finest)
-    return [folder for _, folder in numbered]
+    numbered = sorted((int(match[1]), int(match[2]), folder) for folder, match in named)
+    finest = numbered[0][0]
+    return [folder for level, _, folder in numbered if level == finest]
 
 
 def _listed(index: Path) -> list[Path]:

@@ -123,7 +123,8 @@ def sog_files(splats: Splats, *, ordered: bool = False, progress: Progress = sil
     book, labels = _numbers(log_scales(splats))
     meta["scales"] = {"codebook": book.tolist(), "files": [image("scales", labels)]}
     largest, others = smallest_three(unit_quats(splats.quats))
-    quats = np.column_stack([coded(others / math.sqrt(2) + 0.5, 255), 252 + largest])
+    parts = coded(others / math.sqrt(2) + 0.5, 255)
+    quats = np.column_stack([parts, 252 + largest])
     meta["quats"] = {"files": [image("quats", quats)]}
     book, labels = _numbers(splats.sh0[:, 0])
     sh0 = np.column_stack([labels, coded(splats.opacities, 255)])
@@ -166,7 +167,8 @@ def _means(splats: Splats) -> tuple[Float, Float, Int]:
     logs = np.sign(means) * np.log1p(np.abs(means))
     low = logs.min(axis=0)
     high = logs.max(axis=0)
-    return low, high, coded((logs - low) / np.where(high > low, high - low, 1.0), 65535)
+    wide = np.where(high > low, high - low, 1.0)
+    return low, high, coded((logs - low) / wide, 65535)
 
 
 def _numbers(values: Values) -> tuple[Float32, Rows]:
@@ -190,7 +192,9 @@ def _weights(splats: Splats) -> Float32:
     longer = longer_axes(splats.scales.astype(float)).prod(axis=1)
     shown = np.sqrt(splats.opacities * np.minimum(longer, 1e30))
     mean = shown.mean()
-    return (shown / mean if mean > 0 else np.ones(len(splats))).astype(np.float32)
+    if not mean > 0:
+        return np.ones(len(splats), np.float32)
+    return (shown / mean).astype(np.float32)
 
 
 def _rest(splats: Splats) -> tuple[int, Float32, Bytes, Values]:

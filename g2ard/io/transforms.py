@@ -239,9 +239,9 @@ def _intrinsics(place: Place, frame: _Frame, photo: Path) -> Lens:
     lens = _pinhole(place, frame, (width, height))
     if model in _MODELS:
         return lens
-    K = lens.K
-    k = (frame.k1, frame.k2, frame.k3, frame.k4)
-    return Lens.of(PhotoLens(model, lens.size, (K[0, 0], K[1, 1], K[0, 2], K[1, 2], *k)))
+    (fx, _, cx), (_, fy, cy), _ = lens.K
+    params = fx, fy, cx, cy, frame.k1, frame.k2, frame.k3, frame.k4
+    return Lens.of(PhotoLens(model, lens.size, params))
 
 
 def _pinhole(place: Place, frame: _Frame, size: Size) -> Lens:
@@ -271,8 +271,9 @@ def _matrix(place: Place, frame: _Frame) -> Float | None:
     key = next((key for key in ("K", "intrinsics") if isinstance(getattr(frame, key), list)), None)
     if key is None:
         return None
-    K = np.array(checked(getattr(frame, key), tuple[Vector, Vector, Vector], place.to(key)))
-    if not (K[0, 0] > 0 and K[1, 1] > 0 and np.array_equal(K[2], [0, 0, 1])):
+    rows = checked(getattr(frame, key), tuple[Vector, Vector, Vector], place.to(key))
+    K = np.array(rows)
+    if not (K[0, 0] > 0 and K[1, 1] > 0 and K[2].tolist() == [0, 0, 1]):
         raise place.to(key).error("is not a matrix of focal lengths and a principal point")
     K[0, 1] = K[1, 0] = 0
     return K
@@ -309,9 +310,10 @@ def text_of(path: Path, cameras: Cameras, splits: Splits) -> str:
     shared = lenses[0] if all(lens == lenses[0] for lens in lenses) else {}
     frames = []
     for i, viewmat in enumerate(cameras.viewmats):
-        photo, mask = (
-            (cameras.image_paths[i], cameras.mask_paths[i]) if cameras.lenses[i] is None else (None, None)
-        )
+        photo = mask = None
+        if cameras.lenses[i] is None:
+            photo = cameras.image_paths[i]
+            mask = cameras.mask_paths[i]
         pose = np.asarray(invert_pose(viewmat) @ FLIP)
         frame = {"file_path": beside(photo, path) or f"images/{cameras.names[i]}"}
         if (covered := beside(mask, path)) is not None:
@@ -326,10 +328,11 @@ def text_of(path: Path, cameras: Cameras, splits: Splits) -> str:
 
 def intrinsics_of(cameras: Cameras, i: int) -> Json:
     """Return intrinsics as in transforms.json."""
-    K = cameras.Ks[i]
-    lens: Json = {"w": int(cameras.widths[i]), "h": int(cameras.heights[i])}
-    lens |= {"fl_x": float(K[0, 0]), "fl_y": float(K[1, 1]), "cx": float(K[0, 2]), "cy": float(K[1, 2])}
-    return lens | dict(zip(("k1", "k2", "p1", "p2", "k3"), cameras.distortions[i].tolist(), strict=True))
+    (fx, _, cx), (_, fy, cy), _ = cameras.Ks[i].tolist()
+    k1, k2, p1, p2, k3 = cameras.distortions[i].tolist()
+    size = {"w": int(cameras.widths[i]), "h": int(cameras.heights[i])}
+    pinhole = {"fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy}
+    return {**size, **pinhole, "k1": k1, "k2": k2, "p1": p1, "p2": p2, "k3": k3}
 
 
 def json_rows(rows: list[Json]) -> str:
