@@ -73,7 +73,8 @@ def note_coarse(positions: Values, apart: float) -> Notes:
     """Return a note if float32 rounded (n, 3) positions by much of the distance `apart` between them."""
     if not len(positions) or not np.array_equal(positions, positions.astype(np.float32)):
         return ()
-    step = float(np.spacing(np.abs(positions).max(axis=0).astype(np.float32)).max())
+    farthest = np.abs(positions).max(axis=0)
+    step = float(np.spacing(farthest.astype(np.float32)).max())
     text = (
         f"coordinates are rounded to steps of {step:g} by float32, which is coarse for points {apart:.2g} "
         "apart; export them as float64 (.las, .laz, .e57), or with a shift (CloudCompare's Global Shift)"
@@ -98,8 +99,10 @@ def unpack_colors(packed: Values) -> list[Float]:
 def choose_shades(values: Values, limits: tuple[float, float] | None = None) -> tuple[float, float]:
     """Return the intensities that mean black and white: stated limits, if most values fill a part of them."""
     low, high = bulk_range(values)
-    if limits and low >= limits[0] and high <= limits[1] and high - low >= _FILLED * (limits[1] - limits[0]):
-        return limits
+    if limits:
+        least, most = limits
+        if least <= low and high <= most and high - low >= _FILLED * (most - least):
+            return limits
     return low, high
 
 

@@ -81,7 +81,8 @@ class Stream(PointStream):
 def _points(las: Any, color: Names) -> MarkedPoints:
     positions = np.stack([np.asarray(las[name], float) for name in ("x", "y", "z")], axis=1)
     values = np.stack([np.asarray(las[name], np.float32) for name in color], axis=1)
-    noise = np.isin(np.asarray(las["classification"]), _NOISE) | np.asarray(las["withheld"], bool)
+    noise = np.isin(np.asarray(las["classification"]), _NOISE)
+    noise |= np.asarray(las["withheld"], bool)
     return positions, values, noise
 
 
@@ -148,7 +149,9 @@ def _recovered(path: Path, header: Any) -> bool:
     """Set a count of points of 0 to the number that follow, and return whether there are any."""
     if header.point_count:
         return False
-    minor, legacy, extended = (_number(path, *at) for at in ((25, "<B"), (107, "<I"), (235, "<Q")))
+    minor = _number(path, 25, "<B")
+    legacy = _number(path, 107, "<I")
+    extended = _number(path, 235, "<Q")
     end = path.stat().st_size
     if minor >= 4 and header.offset_to_point_data < extended < end:
         end = extended
@@ -217,7 +220,8 @@ def _check_chunks(path: Path, header: Any) -> None:
         table = lazrs.read_chunk_table(file, layout)
     room, taken = (sum(column) for column in zip(*table, strict=True)) if table else (0, 0)
     there = path.stat().st_size
-    if min((packed for _, packed in table), default=0) < 0 or taken > there - header.offset_to_point_data:
+    least = min((packed for _, packed in table), default=0)
+    if least < 0 or taken > there - header.offset_to_point_data:
         raise damaged(f"broken chunk table: chunks of {taken:,} bytes")
     if room < header.point_count:
         raise damaged(f"truncated: at most {room:,} of {header.point_count:,} points")

@@ -53,7 +53,8 @@ def _frame(place: Place, matrix: np.ndarray, photo: Path | None) -> Frame:
     height, width, focal = matrix[:, 4].tolist()
     if not (height >= 1 and width >= 1 and focal > 0 and np.isfinite(matrix).all()):
         raise place.error(f"has height {height}, width {width} and focal length {focal}")
-    pose = make_rigid(np.hstack([matrix[:, :3] @ _LLFF_AXES, matrix[:, 3:4]]), place)
+    turn = matrix[:, :3] @ _LLFF_AXES
+    pose = make_rigid(np.hstack([turn, matrix[:, 3:4]]), place)
     lens = Lens.pinhole((round(width), round(height)), (focal, focal))
     name = f"{place.index:05d}" if photo is None else photo.name
     return Frame(name, invert_pose(pose), lens, photo)
@@ -61,8 +62,11 @@ def _frame(place: Place, matrix: np.ndarray, photo: Path | None) -> Frame:
 
 def _photos(views: ViewFiles) -> list[Path]:
     """Return the photos that belong to the rows, sorted by name; none if there is no folder of photos."""
-    named = sorted((p for p in views.path.glob("images*") if p.is_dir()), key=lambda p: (len(p.name), p.name))
-    for place in [views.images] if views.images else named:
+    places = [place for place in views.path.glob("images*") if place.is_dir()]
+    places.sort(key=lambda place: (len(place.name), place.name))
+    if views.images:
+        places = [views.images]
+    for place in places:
         if found := photos_in(place):
             return found
     return []

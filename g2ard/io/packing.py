@@ -80,7 +80,8 @@ def packing_order(means: Values, chunk: int = 1) -> Rows:
     near = _NEAR * np.percentile(away, 75)
     if not near > 0 or away.max() < near:
         return morton_order(means)
-    shells = 1 + np.floor(np.log2(np.maximum(away / near, 0.5))).astype(np.intp)
+    doublings = np.log2(np.maximum(away / near, 0.5))
+    shells = 1 + np.floor(doublings).astype(np.intp)
     outwards = np.argsort(away, kind="stable")
     ends = np.cumsum(np.bincount(shells)) // chunk * chunk
     ends = np.unique([0, *ends[:-1], len(means)])
@@ -138,7 +139,8 @@ def smallest_three(quats: Float) -> tuple[Rows, Float]:
     """
     largest = np.argmax(np.abs(quats), axis=1)
     rows = np.arange(len(quats))
-    signed = quats * np.where(quats[rows, largest] < 0, -1.0, 1.0)[:, None]
+    signs = np.where(quats[rows, largest] < 0, -1.0, 1.0)
+    signed = quats * signs[:, None]
     return largest, signed[rows[:, None], _OTHER_COMPONENTS[largest]] + 0.0
 
 
@@ -147,7 +149,8 @@ def from_smallest_three(largest: Values, others: Float) -> Float:
     quats = np.empty((len(others), 4))
     rows = np.arange(len(others))
     quats[rows[:, None], _OTHER_COMPONENTS[largest]] = others
-    quats[rows, largest] = np.sqrt(np.maximum(0, 1 - (others**2).sum(axis=1)))
+    rest = 1 - (others**2).sum(axis=1)
+    quats[rows, largest] = np.sqrt(np.maximum(0, rest))
     return quats
 
 

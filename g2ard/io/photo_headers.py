@@ -118,7 +118,9 @@ def orientation(image: Image.Image) -> int:
 
 def have_same_aspect(size: tuple[float, float], like: tuple[float, float]) -> bool:
     """Return whether two sizes have the same aspect."""
-    return abs(size[0] * like[1] - size[1] * like[0]) <= ASPECT_SLACK * size[1] * like[0]
+    one = size[0] * like[1]
+    other = size[1] * like[0]
+    return abs(one - other) <= ASPECT_SLACK * other
 
 
 def read_focal(path: Path) -> float | None:

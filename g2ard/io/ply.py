@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Iterable, Iterator, Sequence
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -77,7 +78,8 @@ class Stream(RawStream):
         offset = plyfiles.offset_of(header) + shift
         moving = [name for name in names if _TIME.fullmatch(name)]
         moving += [name for name in _DEFORMS if (path.absolute().parent / name).exists()]
-        notes = [*_frames(header), *_ignored([n for n in names if n not in needed], rest, stored, kept)]
+        unused = [name for name in names if name not in needed]
+        notes = [*_frames(header), *_ignored(unused, rest, stored, kept)]
         told = {
             "moving": (len(moving), f"the scene moves in time ({some(moving)}); all times are read as one"),
             "flat_gaussians": (flat * len(rows), _FLAT),
@@ -139,7 +141,8 @@ class Stream(RawStream):
         if self._rgb is None:
             raw.sh0[:, 0] = self._read.sh0(self._columns(block, _DC))
         else:
-            raw.sh0[:, 0] = (self._columns(block, self._rgb) / self._white - 0.5) / SH_C0
+            rgb = self._columns(block, self._rgb) / self._white
+            raw.sh0[:, 0] = (rgb - 0.5) / SH_C0
         raw.log_scales[:, : len(self._scales)] = self._columns(block, self._scales)
         if self._flat:
             raw.log_scales[:, 2] = raw.log_scales[:, :2].min(axis=1) + _FLAT_LOG_RATIO
@@ -169,9 +172,13 @@ def _joined(groups: list[Values]) -> Values:
     for group in groups:
         names = group.dtype.names or ()
         own = sum(name.startswith("f_rest_") for name in names) // 3
-        for name in names:  # harmonics are stored channel after channel
-            k = int(name[7:]) if name.startswith("f_rest_") else -1
-            rows[name if k < 0 else f"f_rest_{k // own * most + k % own}"][at : at + len(group)] = group[name]
+        here = rows[at : at + len(group)]
+        for name in names:
+            target = name
+            if name.startswith("f_rest_"):  # harmonics are stored channel after channel
+                channel, k = divmod(int(name[7:]), own)
+                target = f"f_rest_{channel * most + k}"
+            here[target] = group[name]
         at += len(group)
     return rows
 
@@ -205,9 +212,11 @@ def _frames(header: plyfiles.PlyHeader) -> list[Note]:
 
 def _bands(rest: list[str]) -> tuple[int, int]:
     """Return the numbers of stored and of kept coefficients past band 0 per channel."""
-    if [int(p[7:]) for p in rest] != list(range(len(rest))) or len(rest) not in (0, 9, 24, 45, 72):
-        raise InputError(f"expected f_rest_0 to f_rest_n with 0, 9, 24 or 45 of them, got {len(rest)}")
-    return len(rest) // 3, min(len(rest) // 3, 15)
+    count = len(rest)
+    numbers = [int(name[7:]) for name in rest]
+    if numbers != list(range(count)) or count not in (0, 9, 24, 45, 72):
+        raise InputError(f"expected f_rest_0 to f_rest_n with 0, 9, 24 or 45 of them, got {count}")
+    return count // 3, min(count // 3, 15)
 
 
 def _ignored(unused: list[str], rest: list[str], stored: int, kept: int) -> list[Note]:
@@ -267,9 +276,14 @@ def write(
     return error
 
 
+def _taken_apart(splats: Splats) -> Iterator[Splats]:
+    """Yield a scene in blocks."""
+    return (splats.take(slice(at, at + BLOCK)) for at in range(0, len(splats), BLOCK))
+
+
 def _blocks(parts: Iterable[Splats], names: list[str], normals: bool) -> Iterator[Float32]:
     first = 0
-    for block in (part.take(slice(at, at + BLOCK)) for part in parts for at in range(0, len(part), BLOCK)):
+    for block in chain.from_iterable(map(_taken_apart, parts)):
         n = len(block)
         with np.errstate(divide="ignore", invalid="ignore"):
             logs = np.clip(np.log(block.scales, dtype=float), -LOG_SCALE_LIMIT, LOG_SCALE_LIMIT)

@@ -45,7 +45,9 @@ class Report(Shown):
         told = [f"{name}={_brief(value, _VALUE)}" for name, value in self._values()]
         ends = accumulate(len(text) + 2 for text in told)
         fitting = [text for text, end in zip(told, ends, strict=True) if end <= _LINE]
-        return f"{type(self).__name__}({', '.join(fitting + ['…'] * (len(fitting) < len(told)))})"
+        if len(fitting) < len(told):
+            fitting.append("…")
+        return f"{type(self).__name__}({', '.join(fitting)})"
 
     def rows(self) -> list[tuple[str, str]]:
         """Return the names of fields with a value, and that in at most a line."""

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import zipfile
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from fnmatch import fnmatch
 from functools import wraps
@@ -54,8 +54,8 @@ class Sign(NamedTuple):
 
     def fits(self, path: Path, head: bytes) -> bool:
         """Return whether a file with this head is of this kind; `head` is in small letters."""
-        begins = not self.starts or head[self.at :].startswith(tuple(start.lower() for start in self.starts))
-        if not begins or path.suffix.lower() in self.unless:
+        starts = tuple(start.lower() for start in self.starts) or b""
+        if not head[self.at :].startswith(starts) or path.suffix.lower() in self.unless:
             return False
         named = any(fnmatch(path.name.lower(), name) for name in self.names.split())
         return named and all(word.lower() in head for word in self.words)
@@ -260,12 +260,16 @@ def _shape(head: bytes) -> bytes:
     count = len(rows[0]) if rows else 0
     if any(len(row) != count for row in rows):
         return b""
-    if count == 8 and all(abs(sum(v * v for v in row[4:]) - 1) < 0.02 for row in rows):
+    if count == 8 and _are_unit(row[4:] for row in rows):
         return b"\nnumbers:8 unit"
-    axes = (slice(0, 3), slice(4, 7), slice(8, 11))
-    if count == 12 and all(abs(sum(v * v for v in row[axis]) - 1) < 0.02 for row in rows for axis in axes):
+    if count == 12 and all(_are_unit(row[at : at + 3] for row in rows) for at in (0, 4, 8)):
         return b"\nnumbers:12 rigid"
     return b"\nnumbers:%d" % count
+
+
+def _are_unit(vectors: Iterable[list[float]]) -> bool:
+    """Return whether vectors have a length of 1, as digits allow."""
+    return all(abs(sum(v * v for v in vector) - 1) < 0.02 for vector in vectors)
 
 
 def is_table(path: Path) -> bool:

@@ -154,7 +154,8 @@ class TileStore:
             raise place.to("cells").error(f"has {tree.leaves} leaves for {len(manifest.tiles)} tiles")
         if sum(tile.rows for tile in manifest.tiles) != manifest.count:
             raise place.to("count").error(f"is {manifest.count}, which is not the sum of the tiles' rows")
-        tiles = tuple(msgspec.structs.replace(tile, index=i) for i, tile in enumerate(manifest.tiles))
+        with_index = msgspec.structs.replace
+        tiles = tuple(with_index(tile, index=i) for i, tile in enumerate(manifest.tiles))
         values |= {"tiles": tiles, "offset": np.array(manifest.offset)}
         store = cls(folder, tree=tree, **values)
         for tile in store.tiles if complete else ():
@@ -279,7 +280,7 @@ class TileStore:
             part.log_scales[:] = rows[:, 7:10]
             part.logit_opacities[:] = rows[:, 10]
             part.sh0[:, 0] = rows[:, 11:14]
-            part.shN[:] = rows[:, 14 : 14 + 3 * rest].reshape(len(rows), rest, 3)
+            part.shN[:] = rows[:, 14 : 14 + 3 * rest].reshape(part.shN.shape)
         splats = raw.activated(self.render_model, self.offset.copy(), self.up)
         return replace(splats, axes=self.axes)
 

@@ -46,8 +46,8 @@ class Settings:
             return None
         text = self._text(at, key)
         if text.startswith("*"):
-            anchor = re.escape(text[1:])
-            at = next((i for i, line in enumerate(self._lines) if re.search(rf"&{anchor}\b", line)), None)
+            anchor = re.compile(rf"&{re.escape(text[1:])}\b")
+            at = next((i for i, line in enumerate(self._lines) if anchor.search(line)), None)
             if at is None:
                 text = ""
             else:
@@ -108,13 +108,16 @@ def below(start: Path, path: Path) -> Path | None:
     copied with its data from another system, the longest end of the path that exists there is taken.
     """
     folders = real_path(start).parents
+    places = *folders, Path()
+    for place in places:
+        if (place / path).exists():
+            return place / path
     parts = plain_parts(str(path))
-    if found := next((place / path for place in (*folders, Path()) if (place / path).exists()), None):
-        return found
-    ends = (place.joinpath(*parts[k:]) for k in range(len(parts)) for place in (*folders, Path()))
-    for end in ends:
-        if end.exists() and real_path(end) not in folders:
-            return end
+    for k in range(len(parts)):
+        for place in places:
+            end = place.joinpath(*parts[k:])
+            if end.exists() and real_path(end) not in folders:
+                return end
     return None
 
 

@@ -222,7 +222,8 @@ def _read_prim(pxr: Any, prim: Any) -> Noted:
     size = (degree + 1) ** 2
     raw = Raw.empty(count, size - 1)
     raw.means[:] = means * _USD_TURN
-    raw.quats[:] = _values(pxr, prim, "orientations", 4, count)[:, [3, 0, 1, 2]] * _QUAT_TURN
+    quats = _values(pxr, prim, "orientations", 4, count)[:, [3, 0, 1, 2]]
+    raw.quats[:] = quats * _QUAT_TURN
     alphas = _values(pxr, prim, "opacities", 1, count)[:, 0]
     if coefficients:
         bands = _values(pxr, prim, f"{_SH}Coefficients", 3, count * size).reshape(count, size, 3)
@@ -232,7 +233,8 @@ def _read_prim(pxr: Any, prim: Any) -> Noted:
         rgb = _values(pxr, prim, _COLOR, 3, None)
         if len(rgb) not in (1, count):
             raise InputError(f"has {len(rgb):,} values, expected {count:,}", property=_COLOR)
-        base = np.broadcast_to((rgb / choose_white(rgb, (1.0, 255.0)) - 0.5) / SH_C0, (count, 3))
+        rgb = rgb / choose_white(rgb, (1.0, 255.0))
+        base = np.broadcast_to((rgb - 0.5) / SH_C0, (count, 3))
         notes.append(Note("display_color", count, "colours are those of displayColor, taken as sRGB"))
     notes += fill_linear(raw, _values(pxr, prim, "scales", 3, count), alphas, base)
     if _color_space(pxr, prim).lower().startswith("lin"):

@@ -60,7 +60,8 @@ def lost_views(
     inria = format == "inria"
     nerfstudio = format == "nerfstudio"
     middle = [[w / 2, h / 2] for w, h in zip(cameras.widths, cameras.heights, strict=True)]
-    off = int((abs(cameras.Ks[:, :2, 2] - middle).max(axis=1) > _OFF_CENTRE).sum())
+    beside = abs(cameras.Ks[:, :2, 2] - middle).max(axis=1)
+    off = int((beside > _OFF_CENTRE).sum())
     bent = int(cameras.distortions[:, 0 if inria else 4 :].any(axis=1).sum())
     photos = sum(lens is not None for lens in cameras.lenses)
     kinds = sum(kind != USUAL for kind in cameras.kinds)

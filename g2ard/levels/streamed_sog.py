@@ -196,17 +196,19 @@ class _Files:
         leaves = self.parts[name]
         splats = self.levels[self.level_of[name]].take(np.concatenate(leaves))
         starts = np.cumsum([0, *map(len, leaves)])
-        order = [a + packing_order(splats.means[a:b]) for a, b in pairwise(starts)]
+        means = splats.means
+        order = [a + packing_order(means[a:b]) for a, b in pairwise(starts)]
         return splats.take(np.concatenate(order))
 
 
 def _describe_node(tree: Node, files: _Files) -> dict[str, Any]:
-    ends = np.array([tree.low, tree.high]) @ change_of_axes(files.levels[0].axes, "RDF").T
-    node: dict[str, Any] = {"bound": {"min": _round(ends.min(axis=0)), "max": _round(ends.max(axis=0))}}
+    turn = change_of_axes(files.levels[0].axes, "RDF")
+    ends = np.array([tree.low, tree.high]) @ turn.T
+    bound = {"min": _round(ends.min(axis=0)), "max": _round(ends.max(axis=0))}
     if tree.children:
-        return {**node, "children": [_describe_node(child, files) for child in tree.children]}
-    placed = {str(level): files.place(level, rows) for level, rows in enumerate(tree.rows) if len(rows)}
-    return {**node, "lods": placed}
+        return {"bound": bound, "children": [_describe_node(child, files) for child in tree.children]}
+    placed = {f"{level}": files.place(level, rows) for level, rows in enumerate(tree.rows) if len(rows)}
+    return {"bound": bound, "lods": placed}
 
 
 def _round(values: Sequence[float] | Float) -> list[float]:

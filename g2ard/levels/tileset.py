@@ -84,17 +84,20 @@ class Georeference(Settings):
 
     def matrix(self) -> Float:
         """Return the (4, 4) matrix from x, y (along the heading), z up to earth-centred coordinates."""
-        lon, lat, turn = np.radians((self.longitude, self.latitude, self.heading))
-        east = np.array([-np.sin(lon), np.cos(lon), 0])
-        up = np.array([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)])
+        angles = np.radians((self.longitude, self.latitude, self.heading))
+        sin_lon, sin_lat, sin_turn = np.sin(angles)
+        cos_lon, cos_lat, cos_turn = np.cos(angles)
+        east = np.array([-sin_lon, cos_lon, 0])
+        up = np.array([cos_lat * cos_lon, cos_lat * sin_lon, sin_lat])
         north = np.cross(up, east)
         squared = _WGS84_FLATTENING * (2 - _WGS84_FLATTENING)
-        normal = _WGS84_RADIUS / np.sqrt(1 - squared * np.sin(lat) ** 2)
+        normal = _WGS84_RADIUS / np.sqrt(1 - squared * sin_lat**2)
         matrix = np.eye(4)
-        matrix[:3, 0] = np.cos(turn) * east - np.sin(turn) * north
-        matrix[:3, 1] = np.sin(turn) * east + np.cos(turn) * north
+        matrix[:3, 0] = cos_turn * east - sin_turn * north
+        matrix[:3, 1] = sin_turn * east + cos_turn * north
         matrix[:3, 2] = up
-        matrix[:3, 3] = (normal + self.height) * up - (0, 0, squared * normal * np.sin(lat))
+        matrix[:3, 3] = (normal + self.height) * up
+        matrix[2, 3] -= squared * normal * sin_lat
         return matrix
 
 
