@@ -26,18 +26,15 @@ _COLUMNS = {
 }
 """Columns and their names in headings, in small letters and without units."""
 
-_SHADES = ("red", "green", "blue"), ("intensity",)
-"""Columns that colour points, the best first."""
+_SHADES = ("red", "green", "blue"), ("intensity",)  # columns that colour points, the best first
 
 _TRIPLES = {6: (3,), 7: (4, 3), 8: (5, 4, 3), 9: (6, 3), 10: (7, 6, 4, 3)}
 """Number of columns without a heading → where colours may begin, the likeliest first."""
 
 _ALIKE = 0.5  # least correlation of the channels of colours that tells them from other columns
 
-_LINES = 50
-"""Lines that may be a heading."""
-_HEAD = 1 << 16
-"""Bytes that tell whether a text is a table."""
+_LINES = 50  # lines that may be a heading
+_HEAD = 1 << 16  # bytes that tell whether a text is a table
 
 
 class Stream(HeldPoints):

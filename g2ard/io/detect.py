@@ -216,8 +216,7 @@ def _check_content(path: Path) -> None:
         raise InputError(f"is {sign.what} in spite of its name", hint=hint)
 
 
-_PACKED = ("las", "usd")
-"""Formats with suffixes of which each may hold what content tells as another of them."""
+_PACKED = ("las", "usd")  # formats with suffixes of which each may hold what content tells as another of them
 
 
 def run_scene(path: AnyPath) -> Path:

@@ -13,18 +13,15 @@ from g2ard.io.types import Note, Notes
 from g2ard.progress import plural
 from g2ard.scene.splats import SH_C0
 
-_BULK = 0.98
-"""Share of the values that decides, in samples of more than fifty."""
+_BULK = 0.98  # share of the values that decides, in samples of more than fifty
 
 _FULL = (255.0, 1023.0, 4095.0, 65535.0)  # white in 8, 10, 12 and 16 bits
 HDR = 1.5  # brightest value of float colours of which 1 is white
 _FILLED = 0.25  # part of stated limits that intensities fill
 _FEWEST = 16  # Gaussians that suffice to judge how they are stored
-_OUTSIDE = 0.1
-"""Amount by which opacities leave [0, 1] that tells logits."""
+_OUTSIDE = 0.1  # amount by which opacities leave [0, 1] that tells logits
 
-_ROUNDING = 1e-3
-"""Amount by which opacities leave [0, 1] that is clamped without a note."""
+_ROUNDING = 1e-3  # amount by which opacities leave [0, 1] that is clamped without a note
 
 _WIDE = 4.0  # scale over the distance of neighbours beyond which equal scales are doubted
 _LARGEST_LOGIT = 20.0  # whole numbers up to here may be logits

@@ -19,11 +19,9 @@ _LARGEST_CHUNK = 1 << 30
 """Largest chunk, in bytes of unpacked points, of a file with fewer points than a chunk holds."""
 
 
-_SAMPLES = 20
-"""Runs of points that tell where a file's points are."""
+_SAMPLES = 20  # runs of points that tell where a file's points are
 
-_SAMPLE_ROWS = 5000
-"""Points of each of these runs."""
+_SAMPLE_ROWS = 5000  # points of each of these runs
 
 _NOISE = (7, 18)  # classes of low and high noise
 
@@ -86,8 +84,7 @@ def _points(las: Any, color: Names) -> MarkedPoints:
     return positions, values, noise
 
 
-_UNITS = {9001: 1.0, 9002: 0.3048, 9003: 1200 / 3937}
-"""Code of a unit of length in GeoTIFF keys → its metres."""
+_UNITS = {9001: 1.0, 9002: 0.3048, 9003: 1200 / 3937}  # code of a unit of length in GeoTIFF keys → its metres
 
 
 def _map_of(header: Any) -> tuple[str | None, float | None]:

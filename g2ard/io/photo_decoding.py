@@ -81,10 +81,8 @@ def _read_words(path: Path, image: Any, upright: bool) -> Values:
     return words
 
 
-_BITS = (8, 10, 12, 14)
-"""Bits of colours that are stored in 16."""
-_SAMPLED_PHOTOS = 5
-"""Photos of a folder whose brightest value is compared."""
+_BITS = (8, 10, 12, 14)  # bits of colours that are stored in 16
+_SAMPLED_PHOTOS = 5  # photos of a folder whose brightest value is compared
 
 
 def _choose_white(folder: Path, suffix: str, brightest: int) -> float:

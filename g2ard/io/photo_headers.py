@@ -21,20 +21,13 @@ if TYPE_CHECKING:
 
 ASPECT_SLACK = 0.02
 """Relative difference in aspect ratio that rounding may cause; more means another photo."""
-_ORIENTATION = 0x0112
-"""Tag of the orientation, 1 to 8."""
-_EXIF = 0x8769
-"""Tag of EXIF's own directory."""
-_FOCAL = 0x920A
-"""Tag of the focal length in mm."""
-_FILM_FOCAL = 0xA405
-"""Tag of the equivalent focal length on 35 mm film, in mm."""
-_SENSOR_PIXELS = 0xA20E
-"""Tag of the sensor's pixels per unit."""
-_SENSOR_UNIT = 0xA210
-"""Tag of that unit."""
-_STORED_WIDTH = 0xA002
-"""Tag of the photo's width in pixels."""
+_ORIENTATION = 0x0112  # tag of the orientation, 1 to 8
+_EXIF = 0x8769  # tag of EXIF's own directory
+_FOCAL = 0x920A  # tag of the focal length in mm
+_FILM_FOCAL = 0xA405  # tag of the equivalent focal length on 35 mm film, in mm
+_SENSOR_PIXELS = 0xA20E  # tag of the sensor's pixels per unit
+_SENSOR_UNIT = 0xA210  # tag of that unit
+_STORED_WIDTH = 0xA002  # tag of the photo's width in pixels
 _UNITS = {2: 25.4, 3: 10.0, 4: 1.0, 5: 1e-3}  # millimetres of a unit of sensor pixels: inch, cm, mm and µm
 _FILM_DIAGONAL = math.hypot(36, 24)  # diagonal of 35 mm film, mm
 

@@ -24,10 +24,8 @@ from g2ard.scene.lenses import PhotoLens
 from g2ard.scene.samples import evenly_spaced
 
 _BORDER_PHOTOS = 5  # photos whose borders are compared
-_BORDER_COLOUR_SLACK = 3 / 255
-"""Largest difference from a constant border colour."""
-_BORDER_SHARE = 0.8
-"""Least share of border pixels that have a constant border colour."""
+_BORDER_COLOUR_SLACK = 3 / 255  # largest difference from a constant border colour
+_BORDER_SHARE = 0.8  # least share of border pixels that have a constant border colour
 
 
 def load_photo(

@@ -17,8 +17,7 @@ _POINT = Columns.of("QdddBBBdQ", "POINT3D_ID", *"XYZRGB", "ERROR", "TRACK")
 _NUMBERS = Columns.of("ddddddd", "POINT3D_ID", *"XYZRGB")
 
 
-_LEAST_IMAGES = 2
-"""Least images that place a point."""
+_LEAST_IMAGES = 2  # least images that place a point
 
 
 class Stream(HeldPoints):

@@ -13,14 +13,11 @@ from g2ard.system.shown import Shown
 LEFT_OUT = {"left_out": True}
 """Metadata of an optional field that JSON omits without a value."""
 
-_LINE = 90
-"""Most characters of a report in one line."""
+_LINE = 90  # most characters of a report in one line
 
-_VALUE = 40
-"""Most characters of a value in a line of others."""
+_VALUE = 40  # most characters of a value in a line of others
 
-_ROW = 120
-"""Most characters of a value in a row of its own."""
+_ROW = 120  # most characters of a value in a row of its own
 
 
 @dataclass(frozen=True)

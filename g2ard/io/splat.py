@@ -18,14 +18,10 @@ from g2ard.scene.transform import restored
 _ROW = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
 
 
-_FAR = 1e18
-"""Largest possible scale."""
-_POSSIBLE = 0.75
-"""Least share of rows with possible values."""
-_READ = 128
-"""Rows that are looked at."""
-_TEXT = [*range(9, 14), *range(32, 127)]
-"""Bytes that are all of a text."""
+_FAR = 1e18  # largest possible scale
+_POSSIBLE = 0.75  # least share of rows with possible values
+_READ = 128  # rows that are looked at
+_TEXT = [*range(9, 14), *range(32, 127)]  # bytes that are all of a text
 
 
 class Stream(RawStream):

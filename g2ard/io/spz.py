@@ -58,10 +58,8 @@ _COLOR_SCALE = 0.15  # SPZ's factor for band 0, which leaves room for colours ou
 FLIPS = harmonic_signs((1, -1, -1))
 """Signs of harmonics, which differ between SPZ's axes and those of a .ply."""
 
-_USUAL_BITS = 12
-"""Fractional bits of positions, if they suffice."""
-_MOST_BITS = 20
-"""Most fractional bits of positions."""
+_USUAL_BITS = 12  # fractional bits of positions, if they suffice
+_MOST_BITS = 20  # most fractional bits of positions
 
 
 def read(path: Path) -> Noted:

@@ -34,10 +34,8 @@ MarkedPoints = tuple[Float, Float32, Mask]
 """(n, 3) positions; (n, 3) colours, (n, 1) intensities or (n, 0); (n,) whether the file marks noise."""
 
 _BLACK = 1.5 / 255  # colours below are taken for none
-_FEW_BLACK = 15
-"""Number of black points up to which no note is given."""
-_BLACK_SHARE = 1e-3
-"""Share of black points up to which no note is given."""
+_FEW_BLACK = 15  # number of black points up to which no note is given
+_BLACK_SHARE = 1e-3  # share of black points up to which no note is given
 _APART = 100.0  # distance between clouds, in extents, beyond which they may be in several map systems
 _FAR = 10.0  # distance from the origin, in extents, beyond which coordinates may be those of a map
 _STEEP = 20.0  # extent in z over that in x and y beyond which x and y may be degrees

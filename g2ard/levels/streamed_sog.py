@@ -38,11 +38,9 @@ from g2ard.scene.transform import change_of_axes
 
 _ENVIRONMENT_META = "env/meta.json"
 
-_CHUNK_META = re.compile(r"(\d+_\d+|env)/meta\.json")
-"""Names of a level's files."""
+_CHUNK_META = re.compile(r"(\d+_\d+|env)/meta\.json")  # names of a level's files
 
-_CHUNK_IMAGE = re.compile(r"\w+\.webp")
-"""Names of the images in them."""
+_CHUNK_IMAGE = re.compile(r"\w+\.webp")  # names of the images in them
 
 
 @checks_arguments

@@ -40,11 +40,9 @@ TILE_OF_SCENE = np.array([[-1.0, 0, 0], [0, 0, -1], [0, -1, 0]])
 _SCREEN_SPACE_ERROR = 16.0
 """Error on the screen in pixels at which viewers refine a tile by default (maximumScreenSpaceError)."""
 
-_WGS84_RADIUS = 6378137.0
-"""Major half axis of the ellipsoid WGS 84 in metres."""
+_WGS84_RADIUS = 6378137.0  # major half axis of the ellipsoid WGS 84 in metres
 
-_WGS84_FLATTENING = 1 / 298.257223563
-"""Flattening of the ellipsoid WGS 84."""
+_WGS84_FLATTENING = 1 / 298.257223563  # flattening of the ellipsoid WGS 84
 
 
 @dataclass(frozen=True)
