@@ -8,7 +8,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK = 1
 
 RUST := $(shell find rust -name '*.rs' -o -name '*.wgsl' -o -name Cargo.toml) Cargo.toml Cargo.lock
 
-.PHONY: demo test test-fresh lint docs printed stress fuzz fuzz-guided miri bench wheel wheel-linux ends release-check setup clean
+.PHONY: demo test test-benchmarks test-fresh lint docs printed stress fuzz fuzz-guided miri bench wheel wheel-linux ends release-check setup clean
 
 setup: $(VENV)/.built
 
@@ -33,9 +33,14 @@ demo: $(if $(wildcard $(VENV)/.built),setup,$(VENV)/.plain)
 # Python's tests run in TEST_PROCESSES processes (0: in one), each with two threads for the kernels. Tests of determinism set
 # their own number of threads.
 TEST_PROCESSES ?= 2
+PYTEST = OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 RAYON_NUM_THREADS=2 $(BIN)/python -m pytest --numprocesses $(TEST_PROCESSES) --dist loadfile
 test: setup
 	cargo test --quiet --workspace --profile bench
-	OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 RAYON_NUM_THREADS=2 $(BIN)/python -m pytest --numprocesses $(TEST_PROCESSES) --dist loadfile
+	$(PYTEST)
+
+# The tests of studies, which `make test` skips. `.ci/run` runs them where the last commit changed one, and nightly.yml always.
+test-benchmarks: setup
+	$(PYTEST) tests/benchmarks
 
 # The part of `make test` that needs what a fresh machine has not (ffmpeg, an adapter, a browser, Node packages): it skips there.
 # With `-p g2ard-gpu`, cargo would compile wgpu once more, for other features of what it depends on.

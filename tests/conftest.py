@@ -49,6 +49,17 @@ def pytest_configure(config: pytest.Config) -> None:
         os.environ["XDG_CACHE_HOME"] = os.environ["LOCALAPPDATA"] = plans.name
 
 
+_STUDIES = Path(__file__).with_name("benchmarks")
+
+
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """Leave the tests of studies to `make test-benchmarks`, unless an argument names some of them."""
+    if collection_path != _STUDIES:
+        return None
+    named = (Path(argument.partition("::")[0]).resolve() for argument in config.args)
+    return None if any(path.is_relative_to(_STUDIES) for path in named) else True
+
+
 def pytest_collection_finish() -> None:
     """Spare the garbage collector what stays to the end: modules and collected tests.
 
