@@ -35,9 +35,16 @@ def test_votes_are_the_share_of_rows_above_a_pixel() -> None:
         assert found == pytest.approx(sum(shares), abs=1e-12)
 
 
-@pytest.mark.parametrize("lowest", [-1.0, 0.0])
-@pytest.mark.parametrize("distance", [4, 5, 60, 500, 1e4])
-@pytest.mark.parametrize("share", [0.05, 0.1, 0.3, 0.33, 0.35, 0.6, 0.8])
+SHARES = [0.05, 0.1, 0.3, 0.33, 0.35, 0.6, 0.8]
+DISTANCES = [4, 5, 60, 500, 1e4]
+SKIES = [
+    (share, distance, -1.0 if (row + column) % 2 else 0.0)  # whole spheres and their upper halves in turn
+    for row, share in enumerate(SHARES)
+    for column, distance in enumerate(DISTANCES)
+]
+
+
+@pytest.mark.parametrize(("share", "distance", "lowest"), SKIES)
 def test_no_share_of_sky_moves_what_is_near(share: float, distance: float, lowest: float) -> None:
     scene = courtyard(0.1)
     whole = under_sky(scene, share, distance, lowest)
