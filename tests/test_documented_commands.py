@@ -40,6 +40,10 @@ STUDIES = r"python -m benchmarks run .*"
 """Studies take minutes, and tests/benchmarks runs each kind; here their names and options are checked."""
 
 
+PAGED = "README.md"
+"""Page whose runs write view.html too; tests/cli/test_pages.py and others test those."""
+
+
 def is_complete(words: list[str]) -> bool:
     """Return whether code quoted in a sentence is a command, and not only the name of one or of an option."""
     names = {*STAND_INS, *PLACEHOLDERS}
@@ -87,6 +91,8 @@ class Reader:
         if re.fullmatch(STUDIES, command):
             assert arguments[1].endswith(".toml") or (DEFINITIONS / f"{arguments[1]}.toml").is_file()
             small = ["--print-config"]
+        if arguments[0] == "distill" and self.page != PAGED and "page:" not in command:
+            small.append("--no-page")
         status, _, error = self.command_line(*program[2:], *arguments, *small, cwd=self.folder)
         assert status == 0, f"{self.page}: {command}\n{error}"
 
