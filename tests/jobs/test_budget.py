@@ -123,10 +123,10 @@ def test_simplify_fits(tmp_path: Path, command_line: CommandLine) -> None:
 
 @pytest.mark.parametrize("recovered", [False, True])
 def test_quest3_bounds_overdraw(recovered: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    scene, said = checkered_ball(6000), []
+    scene, said = checkered_ball(3000), []
     reduce = Reduction(InMemory(scene), blind=True, recovered=recovered, say=said.append)
     plain = reduce.resolve(Budget(fit="quest3"), "a", "a.ply")
-    assert plain.count == reduce.resolve(Budget(fit="web"), "a", "a.ply").count == 6000
+    assert plain.count == reduce.resolve(Budget(fit="web"), "a", "a.ply").count == 3000
     dense = close_up(scene)
     assert dense is not None
     monkeypatch.setitem(LAYERS, "quest3", dense["mean"] / 1.3)

@@ -77,7 +77,7 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize("name", [name for name in SCENES if name != "landscape"])  # "map" is one
 def test_simplified_scenes_look_alike(
     name: str, inputs: Path, command_line: CommandLine, tmp_path: Path
 ) -> None:
@@ -142,7 +142,8 @@ def test_clutter_is_removed_alike(inputs: Path, command_line: CommandLine, tmp_p
     dust = replace(some, scales=some.scales / 50, logit_opacities=np.full(400, -4.0, np.float32))
     g2ard.save(tmp_path / "cluttered.ply", join([dense, giant, dust]))
     call = ("distill", "cluttered.ply", "-n", 300, "--clean", "--steps", 10, "--size", 64, "--no-page")
-    one, other = both(command_line, tmp_path, *call, output="")
+    given = ("--views", inputs / "views.json", "--focus", "far")
+    one, other = both(command_line, tmp_path, *call, *given, output="")
     for kind, count in one["cleaned"].items():
         assert other["cleaned"][kind] == pytest.approx(count, rel=0.1, abs=8), (kind, one, other)
     assert other["cleaned"]["giant"] == 1
@@ -175,7 +176,6 @@ def test_parents_are_of_the_rows_of_the_file(
 
 INPUTS = {
     "object": ("object.ply",),
-    "landscape": ("landscape.ply",),
     "views": ("landscape.ply", "--views", "views.json"),
     "photos": ("landscape.ply", "--views", "photos.json"),
     "cloud": ("cloud.ply",),
