@@ -117,7 +117,7 @@ def _doubt_distances(votes: Votes) -> list[str]:
 
 
 def _sample_visible(scene: Splats) -> Splats:
-    rows = np.flatnonzero(scene.opacities > 1 / 255)
+    rows = scene.visible_rows()
     some = scene.take(rows[canonical_order(scene, rows, _SAMPLE)])
     return some.take(some.finite_rows())
 

@@ -13,7 +13,7 @@ import g2ard._core as _core
 from g2ard.arrays import Float, Float32, Mask, Values
 from g2ard.errors import InputError
 from g2ard.poses.votes import Votes
-from g2ard.scene.reproducible import canonical_order, middle, norms, quantile, turned
+from g2ard.scene.reproducible import canonical_order, middle, norms, positive, quantile, quantiles, turned
 from g2ard.scene.splats import Splats
 from g2ard.scene.transform import rotation_matrices
 from g2ard.system.cached import cached_property
@@ -24,6 +24,9 @@ opacity."""
 
 _BEYOND = 4096
 """Gaussians that represent what is not near."""
+
+_BOX = (0.01, 0.99)
+"""Quantiles along each axis that bound the box which gives the size."""
 
 _WIDEST = 16.0
 """Largest area that counts, in median areas; otherwise a sky of a few hundred rows outweighs the rest."""
@@ -101,7 +104,7 @@ class Matter:
         Raises:
             InputError: nothing is visible.
         """
-        rows = np.flatnonzero(splats.opacities > 1 / 255)
+        rows = splats.visible_rows()
         visible = len(rows)
         rows = rows[canonical_order(splats, rows, limit)]
         represents *= visible / max(1, len(rows))
@@ -113,17 +116,18 @@ class Matter:
         order = np.argsort(scales, axis=1, kind="stable")
         scales = np.take_along_axis(scales, order, axis=1).astype(np.float64)
         areas = scales[:, 1] * scales[:, 2]
-        if not (areas > 0).any():
+        flat_areas = areas[areas > 0]
+        if not len(flat_areas):
             raise InputError(
                 "the scene has no visible Gaussian with a surface, so no poses can be planned; give views"
             )
-        weights = opacities * np.minimum(areas / middle(areas[areas > 0]), _WIDEST)
+        weights = opacities * np.minimum(areas / middle(flat_areas), _WIDEST)
         votes = Votes.of(means, np.sqrt(areas), opacities, represents)
         near = _find_near(means, opacities, votes)
         some = np.flatnonzero(near)[:_SAMPLE]
-        box = np.array([quantile(means[some, a], weights[some], [0.01, 0.99]) for a in range(3)])
-        size = float(norms((box[:, 1] - box[:, 0])[None])[0]) / 2
-        size = max(size, 2 * middle(scales[some, 2]))  # a single Gaussian also needs a size
+        box = quantiles(means[some], weights[some], _BOX)  # (3, 2)
+        diagonal = float(norms((box[:, 1] - box[:, 0])[None])[0])
+        size = max(diagonal / 2, 2 * middle(scales[some, 2]))  # a single Gaussian also needs a size
         origin = box.mean(axis=1)
         return cls(
             points=(means[near] - origin) / size,
@@ -154,8 +158,7 @@ class Matter:
     @cached_property
     def faces(self) -> Float:
         """(M,) mass × flatness, where flatness is 1 − smallest / middle scale."""
-        thick = np.maximum(self.scales[:, 1], np.finfo(float).tiny)
-        return self.weights * (1 - self.scales[:, 0] / thick)
+        return self.weights * (1 - self.scales[:, 0] / positive(self.scales[:, 1]))
 
     def axes(self, rows: Any) -> Float:
         """Return (m, 3, 3) the unit axes of some rows, by ascending scale."""
@@ -171,17 +174,19 @@ def _find_near(means: Float, weights: Float, votes: Votes) -> Mask:
     rows and much area.
     """
     rows = np.flatnonzero(norms(means - votes.centre) <= votes.radius)
-    means, weights, every = means[rows], weights[rows], len(means)
+    found = np.zeros(len(means), bool)
+    means = means[rows]
+    weights = weights[rows]
     near = np.ones(len(rows), bool)
     for _ in range(4):
         some = np.flatnonzero(near)[:_SAMPLE]
-        centre = np.array([quantile(means[some, a], weights[some], 0.5) for a in range(3)])
+        centre = quantiles(means[some], weights[some], 0.5)
         distances = norms(means - centre)
-        within = distances <= _FAR * float(quantile(distances[some], weights[some], 2 / 3))
+        typical = float(quantile(distances[some], weights[some], 2 / 3))
+        within = distances <= _FAR * typical
         if (within == near).all():
             break
         near = within
-    found = np.zeros(every, bool)
     found[rows[near]] = True
     return found
 
@@ -209,53 +214,44 @@ class Grid:
     def of(cls, low: Float, high: Float, matter: Matter, axes: Float) -> Grid:
         """Fill the box from `low` to `high`, along the rows of `axes`."""
         count = len(matter.points)
-        cells = _CELLS_A_ROW * count if matter.represents > 1 else int(np.clip(count, *_CELLS))
+        cells = int(np.clip(count, *_CELLS))
+        if matter.represents > 1:
+            cells = _CELLS_A_ROW * count
         sides = np.maximum(high - low, np.max(high - low) * _LEAST_SIDE)
         cell = float(np.cbrt(np.prod(sides) / cells))
         shape = np.maximum(1, np.ceil(sides / cell)).astype(int)
-        points = turned(matter.points, axes)
-        filled = np.zeros(int(np.prod(shape)))
-        logs = np.zeros(int(np.prod(shape)))
-        sizes = 0.5 * np.log(np.maximum(matter.scales[:, 1] * matter.scales[:, 2], np.finfo(float).tiny))
-        faces = 2 * np.pi * matter.scales[:, 1] * matter.scales[:, 2] / cell**2
-        optical = matter.represents * matter.opacities * faces
-        parts = np.clip(np.ceil(_HALF_WIDTH * matter.scales[:, 2] / cell), 1, _PARTS).astype(np.int8)
-        for count in np.unique(parts).tolist():
-            rows = np.flatnonzero(parts == count)
-            spans = np.zeros((1, 2, 3))
-            if count > 1:
-                spans = matter.axes(rows)[:, 1:] * matter.scales[rows, 1:, None]
-                spans = turned(spans.reshape(-1, 3), axes).reshape(-1, 2, 3)
-            offsets = _HALF_WIDTH * ((np.arange(count) + 0.5) / count * 2 - 1)
-            for a, b in product(offsets, offsets):
-                index, inside = _index_cells(
-                    points[rows] + a * spans[:, 0] + b * spans[:, 1], low, cell, shape
-                )
-                share = optical[rows[inside]] / count**2
-                size = sizes[rows[inside]]
-                np.add.at(filled, index[inside], share)
-                np.add.at(logs, index[inside], share * size)
-        scale = np.zeros(len(filled), np.float32)
-        some = filled > 0
-        scale[some] = np.exp(logs[some] / filled[some])
-        opaque, murky = (_count_steps((filled > limit).reshape(shape)) for limit in (_OPAQUE, _MURKY))
-        return cls(low, cell, opaque, murky, scale.reshape(shape))
+        depth, logs = _fill_cells(low, cell, shape, matter, axes)
+        scale = np.zeros(len(depth), np.float32)
+        some = depth > 0
+        scale[some] = np.exp(logs[some] / depth[some])
+        return cls(
+            low=low,
+            cell=cell,
+            opaque=_count_steps((depth > _OPAQUE).reshape(shape)),
+            murky=_count_steps((depth > _MURKY).reshape(shape)),
+            scale=scale.reshape(shape),
+        )
 
     def distance(self, points: Float) -> Float:
         """Return (M,) distances to the nearest murky cell, or to the box if that is farther.
 
         Distances within the box are at most `_REACH` − 1 cells.
         """
-        index, inside = _index_cells(points, self.low, self.cell, np.array(self.murky.shape))
-        found = np.maximum(self.murky.ravel()[index].astype(np.float64) - 1, 0) * self.cell
+        index, inside = self._index(points)
+        steps = self.murky.ravel()[index].astype(np.float64)
+        found = np.maximum(steps - 1, 0) * self.cell
         high = self.low + self.cell * np.array(self.murky.shape)
-        outside = norms(np.maximum(0, np.maximum(self.low - points, points - high)))
+        gaps = np.maximum(self.low - points, points - high)  # along each axis, negative within the box
+        outside = norms(np.maximum(0, gaps))
         return np.where(inside, found, np.maximum(outside, found))
 
     def scale_at(self, points: Float) -> Float:
         """Return (M,) values of `scale` in the cells of points, 0 outside the box."""
-        index, inside = _index_cells(points, self.low, self.cell, np.array(self.murky.shape))
+        index, inside = self._index(points)
         return np.where(inside, self.scale.ravel()[index], 0.0)
+
+    def _index(self, points: Float) -> tuple[Any, Mask]:
+        return _index_cells(points, self.low, self.cell, np.array(self.murky.shape))
 
     def cast(self, eyes: Float, directions: Float, *, murky: bool = False) -> Float:
         """Return (M,) distances at which unit rays meet an opaque or a murky cell; inf without one."""
@@ -270,14 +266,50 @@ class Grid:
         )
 
 
+def _fill_cells(low: Float, cell: float, shape: Values, matter: Matter, axes: Float) -> tuple[Float, Float]:
+    """Spread the Gaussians over the cells that they cover.
+
+    A Gaussian wider than a cell is represented by n × n points on the disc of its two longer axes.
+
+    Returns:
+        The (cells,) sums of opacity × area per face of a cell; and these sums weighted with the logarithm of
+        the Gaussians' sizes.
+    """
+    filled = np.zeros(int(np.prod(shape)))
+    logs = np.zeros(len(filled))
+    points = turned(matter.points, axes)
+    middle_scales = matter.scales[:, 1]
+    largest = matter.scales[:, 2]
+    sizes = 0.5 * np.log(positive(middle_scales * largest))
+    faces = 2 * np.pi * middle_scales * largest / cell**2
+    optical = matter.represents * matter.opacities * faces
+    parts = np.clip(np.ceil(_HALF_WIDTH * largest / cell), 1, _PARTS).astype(np.int8)
+    for count in np.unique(parts).tolist():
+        rows = np.flatnonzero(parts == count)
+        spans = np.zeros((1, 2, 3))
+        if count > 1:
+            spans = matter.axes(rows)[:, 1:] * matter.scales[rows, 1:, None]
+            spans = turned(spans.reshape(-1, 3), axes).reshape(-1, 2, 3)
+        offsets = _HALF_WIDTH * ((np.arange(count) + 0.5) / count * 2 - 1)
+        for a, b in product(offsets, offsets):
+            places = points[rows] + a * spans[:, 0] + b * spans[:, 1]
+            index, inside = _index_cells(places, low, cell, shape)
+            here = rows[inside]
+            share = optical[here] / count**2
+            np.add.at(filled, index[inside], share)
+            np.add.at(logs, index[inside], share * sizes[here])
+    return filled, logs
+
+
 def _index_cells(points: Float, low: Float, cell: float, shape: Values) -> tuple[Any, Mask]:
     """Return flat cell indices, clamped into the box, and whether each point was in it."""
     flat = np.zeros(len(points), np.int64)
     inside = np.ones(len(points), bool)
     for axis in range(3):
+        count = shape[axis]
         place = np.floor((points[:, axis] - low[axis]) / cell)
-        inside &= (place >= 0) & (place < shape[axis])
-        flat = flat * shape[axis] + np.clip(place, 0, shape[axis] - 1).astype(np.int64)
+        inside &= (place >= 0) & (place < count)
+        flat = flat * count + np.clip(place, 0, count - 1).astype(np.int64)
     return flat, inside
 
 
@@ -288,7 +320,8 @@ def _count_steps(filled: Mask) -> NDArray[np.int8]:
     for _ in range(1, _REACH):
         for axis in range(3):
             wider = filled.copy()
-            after, before = (np.moveaxis(cells, axis, 0) for cells in (wider, filled))
+            before = np.moveaxis(filled, axis, 0)
+            after = np.moveaxis(wider, axis, 0)  # a view: what is set here is set in `wider`
             after[1:] |= before[:-1]
             after[:-1] |= before[1:]
             filled = wider

@@ -9,7 +9,7 @@ import numpy as np
 from g2ard.arrays import Float
 from g2ard.poses.sight import Lens, Poses, Rays, Survey, gather
 from g2ard.poses.site import Site
-from g2ard.scene.reproducible import between, directions, halton, norms, quantile, turned
+from g2ard.scene.reproducible import between, directions, directions_at, halton, norms, quantile, turned
 from g2ard.scene.samples import evenly_spaced
 
 _ELEVATIONS = (-5.0, 50.0)
@@ -63,8 +63,11 @@ _OVERLAP = 5.0
 _INSET = 0.1
 """Margin that no pose aims at, as a share of the scene's sides: frames there would show the outside."""
 
-_HEIGHTS = (0.85, 0.3)
-"""Smallest factor on the height of a pose, and the range above it, so that poses see at several scales."""
+_LEAST_HEIGHT = 0.85
+"""Smallest factor on the height of a pose."""
+
+_HEIGHT_RANGE = 0.3
+"""Range of this factor, so that poses see at several scales."""
 
 _ABOVE = 1.3
 """Least height, as a multiple of the height of what stands on the ground."""
@@ -83,15 +86,15 @@ def plan_orbit(survey: Survey, count: int, shift: int = 0, first: int | None = N
     dropped. The others see the object, because it fills their frame. `first` is a second limit on the number.
     """
     site = survey.site
-    lens = survey.lens
     target = site.box.mean(axis=0)
+    farthest = _BELOW_SKY * site.horizon - norms((target - site.centre)[None])
 
     def tried(start: int, stop: int) -> tuple[Poses, Float]:
         turn, rise, chance = halton(start, stop, 3, survey.seed + shift).T
         z = between(np.sin(np.radians(_ELEVATIONS)), rise)
         outward = directions(turn, np.sqrt(1 - z * z), z)
-        distances = _fit_distances(site, target, outward, lens) * between(_DISTANCES, chance)
-        distances = np.minimum(distances, _BELOW_SKY * site.horizon - norms((target - site.centre)[None]))
+        fitting = _fit_distances(site, target, outward, survey.lens)
+        distances = np.minimum(fitting * between(_DISTANCES, chance), farthest)
         poses = Poses(target + distances[:, None] * outward, -outward)
         free = site.is_free(poses.eyes, 2, _LOWEST)
         clear = Rays(survey, poses).close > _CLEAR_CELLS * site.grid.cell
@@ -108,7 +111,8 @@ def _fit_distances(site: Site, target: Float, outward: Float, lens: Lens) -> Flo
     distances = np.empty(len(outward))
     for i, frame in enumerate(Poses(outward, -outward).frames()):
         x, y, z = turned(points, frame).T
-        distances[i] = quantile(np.maximum(np.abs(x) / wide, np.abs(y) / tall) - z, weights, _FITTING)
+        in_frame = np.maximum(np.abs(x) / wide, np.abs(y) / tall)  # least depths that hold the points
+        distances[i] = quantile(in_frame - z, weights, _FITTING)
     return np.maximum(distances, _OUTSIDE)
 
 
@@ -118,52 +122,63 @@ def ring(survey: Survey, rises: Sequence[float], turns: int) -> Poses:
     Poses in matter are dropped.
     """
     site = survey.site
-    body = survey.site.body
     points = site.points[:_OUTLINE]
-    (wide, tall) = np.array(survey.lens.tangents) * _FILLED
-    rise, turn = (part.ravel() for part in np.meshgrid(np.radians(rises), np.arange(turns) / turns))
-    gazes = -directions(turn, np.cos(rise), np.sin(rise))
+    rise, turn = np.meshgrid(np.radians(rises), np.arange(turns) / turns)
+    gazes = -directions_at(turn.ravel(), rise.ravel())
     eyes = np.empty_like(gazes)
     for i, frame in enumerate(Poses(gazes, gazes).frames()):
-        x, y, z = turned(points, frame).T
-        eye = np.zeros(3)
-        for _ in range(_ROUNDS):  # aim at the middle of what the frame shows, as near as it fits
-            away = _measure_away(x - eye[0], y - eye[1], wide, tall, body) - z
-            eye[2] = -float(quantile(away, site.weights[:_OUTLINE], _WHOLE))
-            ahead = np.flatnonzero(away <= -eye[2])
-            for axis, across in ((0, x), (1, y)):
-                slopes = (across[ahead] - eye[axis]) / np.maximum(z[ahead] - eye[2], _NEAREST)
-                eye[axis] -= eye[2] * (slopes.max() + slopes.min()) / 2
-        eyes[i] = eye @ frame
+        eyes[i] = _fit_eye(survey, turned(points, frame)) @ frame
     return Poses(eyes, gazes).take(site.is_free(eyes, 2, _LOWEST))
 
 
-def _measure_away(x: Float, y: Float, wide: float, tall: float, body: float) -> Float:
-    """Return the distances from which points (x, y) off the line of sight, and `body` around them, are in
-    frame."""
+def _fit_eye(survey: Survey, points: Float) -> Float:
+    """Return the (3,) eye of a view that just holds points right, down and ahead, in these directions.
+
+    In turns, it aims at the middle of what the frame shows, and stands as near as it fits.
+    """
+    weights = survey.site.weights[:_OUTLINE]
+    x, y, z = points.T
+    eye = np.zeros(3)
+    for _ in range(_ROUNDS):
+        away = _measure_away(survey, x - eye[0], y - eye[1]) - z
+        eye[2] = -float(quantile(away, weights, _WHOLE))
+        ahead = np.flatnonzero(away <= -eye[2])
+        depths = np.maximum(z[ahead] - eye[2], _NEAREST)
+        for axis, across in ((0, x), (1, y)):
+            slopes = (across[ahead] - eye[axis]) / depths
+            eye[axis] -= eye[2] * (slopes.max() + slopes.min()) / 2
+    return eye
+
+
+def _measure_away(survey: Survey, x: Float, y: Float) -> Float:
+    """Return the distances from which points (x, y) off the line of sight, and the body of a Gaussian around
+    them, are in frame."""
+    body = survey.site.body
+    wide, tall = np.array(survey.lens.tangents) * _FILLED
     return np.maximum((np.abs(x) + body) / wide, (np.abs(y) + body) / tall) + body
 
 
 def circle(survey: Survey, gazes: Float) -> Poses:
-    """Return poses on a level circle around a scene, with all of it just in frame."""
+    """Return poses on a level circle around a scene, with all of it just in frame.
+
+    In turns, they aim at the middle of what the frames show, and stand as near as it fits all of them.
+    """
     target = survey.site.box.mean(axis=0)
-    body = survey.site.body
     points = survey.site.points[:_OUTLINE] - target
     weights = survey.site.weights[:_OUTLINE]
-    wide, tall = np.array(survey.lens.tangents) * _FILLED
     frames = Poses(gazes, gazes).frames()
     seen = [turned(points, frames[i]).T for i in evenly_spaced(len(gazes), _FITTED)]
-    away = down = 0.0
-    for _ in range(_ROUNDS):  # aim at the middle of what the frames show, as near as it fits all of them
-        needed = [_measure_away(x, y - down, wide, tall, body) - z for x, y, z in seen]
-        away = max(float(quantile(one, weights, _WHOLE)) for one in needed)
-        slopes = np.concatenate(
-            [
-                ((y - down) / np.maximum(z + away, _NEAREST))[one <= away]
-                for (_, y, z), one in zip(seen, needed, strict=True)
-            ]
-        )
-        down += away * float(slopes.max() + slopes.min()) / 2
+    away = 0.0
+    down = 0.0
+    for _ in range(_ROUNDS):
+        needed = [_measure_away(survey, x, y - down) - z for x, y, z in seen]
+        away = max(float(quantile(distances, weights, _WHOLE)) for distances in needed)
+        slopes = []
+        for (_, y, z), distances in zip(seen, needed, strict=True):
+            slope = (y - down) / np.maximum(z + away, _NEAREST)
+            slopes.append(slope[distances <= away])
+        all_slopes = np.concatenate(slopes)
+        down += away * float(all_slopes.max() + all_slopes.min()) / 2
     return Poses(target + down * frames[:, 1] - away * gazes, gazes)
 
 
@@ -175,21 +190,22 @@ def plan_aerial(survey: Survey, count: int, shift: int = 0, first: int | None = 
     quarters of the frame covered are preferred. `first` limits the number without changing the height.
     """
     site = survey.site
-    lens = survey.lens
-    height = _choose_height(site, count, lens)
+    height = _choose_height(site, count, survey.lens)
+    inset = _INSET * site.sides
 
     def tried(start: int, stop: int) -> tuple[Poses, Float]:
         x, y, kind, turn, pitch, chance = halton(start, stop, 6, survey.seed + shift).T
-        inset = _INSET * (site.box[1] - site.box[0])
-        spots = site.box[0] + inset + (site.box[1] - site.box[0] - 2 * inset) * np.stack([x, y, x], axis=1)
+        spots = site.box[0] + inset + (site.sides - 2 * inset) * np.stack([x, y, x], axis=1)
         spots[:, 2] = site.ground(spots)
         nadir = kind < _NADIR
-        down = np.where(nadir, np.pi / 2, np.radians(between(_PITCHES, pitch)))
+        oblique = np.radians(between(_PITCHES, pitch))
+        down = np.where(nadir, np.pi / 2, oblique)
         gazes = directions(turn, np.where(nadir, 0.0, np.cos(down)), -np.sin(down))
-        away = height * (_HEIGHTS[0] + _HEIGHTS[1] * chance) / np.sqrt(np.sin(down))
+        away = height * (_LEAST_HEIGHT + _HEIGHT_RANGE * chance) / np.sqrt(np.sin(down))
         poses = Poses(spots - away[:, None] * gazes, gazes)
-        seen, free = Rays(survey, poses), site.is_free(poses.eyes, 3, 0.0)
-        return poses, np.where(free & (seen.close > _CLEAR * height), seen.covered / _COVERED, 0.0)
+        seen = Rays(survey, poses)
+        clear = site.is_free(poses.eyes, 3, 0.0) & (seen.close > _CLEAR * height)
+        return poses, np.where(clear, seen.covered / _COVERED, 0.0)
 
     return gather(survey, count if first is None else min(first, count), tried)
 
@@ -199,8 +215,10 @@ def _choose_height(site: Site, count: int, lens: Lens) -> float:
 
     It is at most the height from which one frame spans the scene, and always above what stands on the ground.
     """
-    sides = (site.box[1] - site.box[0])[:2]
+    sides = site.sides[:2]
     wide, tall = lens.tangents
-    by_count = np.sqrt(_OVERLAP * sides[0] * sides[1] / (max(1.0, _NADIR * count) * 4 * wide * tall))
+    nadir_views = max(1.0, _NADIR * count)
+    # A frame from height h covers 4 h² wide·tall of the ground.
+    by_count = np.sqrt(_OVERLAP * sides[0] * sides[1] / (nadir_views * 4 * wide * tall))
     fits = min(sides) / (2 * min(wide, tall))
     return float(max(min(by_count, fits), _ABOVE * site.tallness))

@@ -9,7 +9,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import ArrayLike
 
-from g2ard.arrays import Float, Mask
+from g2ard.arrays import Float, Int, Mask
 from g2ard.config.choices import POOL_KINDS
 from g2ard.errors import InputError, require
 from g2ard.io.splits import HOLD_OUT
@@ -32,7 +32,7 @@ from g2ard.poses.within import (
 )
 from g2ard.progress import Progress, silent
 from g2ard.scene.cameras import Camera, Cameras
-from g2ard.scene.reproducible import middle, norms, strata
+from g2ard.scene.reproducible import middle, norms, positive, strata
 from g2ard.scene.splats import Splats
 
 _PLANNERS: dict[str, Callable[..., Poses]] = {
@@ -53,9 +53,11 @@ _COARSE = (0.2, 0.4)
 """Shares of the matter seen only below a pixel between which more and more poses step nearer. Measured:
 objects .06–.17, whole scenes .01–.06, two chunks cut from a room, seen from outside, .44 and .55."""
 
-_BEYOND = (0.05, 0.1)
-"""Share of the scene beyond near matter that no frame needs to hold, and the largest share of a pool that
-looks there: a sky has few details."""
+_BEYOND_UNSEEN = 0.05
+"""Share of the scene beyond near matter that no frame needs to hold."""
+
+_MOST_BEYOND = 0.1
+"""Largest share of a pool that looks beyond near matter: a sky has few details."""
 
 _FOV = 50.0
 """Horizontal field of view in degrees of poses around or above a scene."""
@@ -206,8 +208,7 @@ def plan_pool(
         before = used
         poses, used, why = _plan(survey, kind, wanted)
         if set(before) - set(used):  # more poses from above are lower, and may be judged otherwise
-            rest = np.linspace(0, len(poses) - 1, wanted - count).round().astype(int)
-            poses = Poses.joined([first, poses.take(rest)])
+            poses = Poses.joined([first, poses.take(_spread_rows(len(poses), wanted - count))])
             used = list(dict.fromkeys([*before, *used]))
     if len(poses) < count:
         raise InputError(
@@ -216,16 +217,18 @@ def plan_pool(
             "or give views of the scene"
         )
     poses, looks_beyond = _add_beyond(survey, poses)
-    used += ["beyond"] if looks_beyond else []
+    if looks_beyond:
+        used.append("beyond")
     reach = reach_of(survey, poses)
     more = partial(_plan_more, survey, poses, reach)
-    need = max(float(np.interp(reach[2].mean(), _COARSE, (0, 1))), 1 - held)
+    coarse_need = float(np.interp(reach.coarse.mean(), _COARSE, (0, 1)))
+    need = max(coarse_need, 1 - held)
     near_poses = plan_near(survey, poses, reach, int(near * need * len(poses)), 1)
     if len(near_poses):
         poses = _replace_some(poses, near_poses)
-        used = [*used, "near"]
+        used.append("near")
         reach = reach_of(survey, poses)
-    spread = max(float(np.ptp(poses.eyes, axis=0).max()), np.finfo(float).tiny)
+    spread = positive(np.ptp(poses.eyes, axis=0).max())
     features = np.concatenate([poses.eyes / spread, poses.gazes / 4], axis=1)  # close for similar poses
     order = strata(features, HOLD_OUT, seed)
     progress("poses", 1, 1)
@@ -234,27 +237,33 @@ def plan_pool(
         " + ".join(used),
         f"{why}; {site.vertical.why}",
         site.vertical.axis,
-        unseen=float((reach[0] < 0).mean()),
-        coarse=float(reach[2].mean()),
+        unseen=float((reach.nearest < 0).mean()),
+        coarse=float(reach.coarse.mean()),
         more=more,
     )
 
 
+def _spread_rows(count: int, some: int) -> Int:
+    """Return `some` evenly spread rows of `count`."""
+    return np.linspace(0, count - 1, some).round().astype(np.int64)
+
+
 def _replace_some(poses: Poses, others: Poses) -> Poses:
     """Return as many poses as before, of which `others` take the places of evenly spread ones."""
-    kept = np.linspace(0, len(poses) - 1, len(poses) - len(others)).round().astype(int)
+    kept = _spread_rows(len(poses), len(poses) - len(others))
     return Poses.joined([poses.take(kept), others])
 
 
 def _add_beyond(survey: Survey, poses: Poses) -> tuple[Poses, bool]:
     """Let some poses look at a sky or surroundings that no frame holds; return whether any does."""
-    if not len(survey.site.beyond):
+    beyond = survey.site.beyond
+    if not len(beyond):
         return poses, False
-    missing = ~framed(survey, poses, survey.site.beyond)
-    share = survey.site.beyond_share * float(missing.mean()) - _BEYOND[0]
-    others = round(float(np.clip(share, 0, _BEYOND[1])) * len(poses))
-    points = survey.site.beyond[missing]
-    return _replace_some(poses, plan_beyond(survey, poses, points, others)), others > 0
+    missing = ~framed(survey, poses, beyond)
+    share = survey.site.beyond_share * float(missing.mean()) - _BEYOND_UNSEEN
+    count = round(float(np.clip(share, 0, _MOST_BEYOND)) * len(poses))
+    others = plan_beyond(survey, poses, beyond[missing], count)
+    return _replace_some(poses, others), count > 0
 
 
 def _plan(survey: Survey, kind: str, count: int) -> tuple[Poses, list[str], str]:
@@ -270,17 +279,35 @@ def _plan(survey: Survey, kind: str, count: int) -> tuple[Poses, list[str], str]
 def _plan_more(survey: Survey, poses: Poses, reach: Reach, kind: str, count: int) -> list[Camera]:
     """Plan `Pool.more` views; near ones step from `poses`, with another seed than the pool's own."""
     survey.tell(0, 0)
+    wide = replace(survey, lens=Lens(survey.lens.size, WIDE))
     if kind == "near":
         views = survey.cameras(plan_near(survey, poses, reach, count))
+    elif kind == "anywhere":
+        views = wide.cameras(plan_anywhere(wide, count))
     else:
-        wide = replace(survey, lens=Lens(survey.lens.size, WIDE))
-        if kind == "anywhere":
-            found = plan_anywhere(wide, count)
-        else:
-            # Below a ceiling, not on it.
-            found = plan_walk(wide, count, 3, indoors=True if is_hidden(survey) else None)
-        views = wide.cameras(found)
+        indoors = True if is_hidden(survey) else None  # below a ceiling, not on it
+        views = wide.cameras(plan_walk(wide, count, 3, indoors=indoors))
     return [replace(view, name=view.name.replace("pose", kind), kind=kind) for view in views]
+
+
+class _Mix:
+    """Poses of several kinds, up to a number."""
+
+    def __init__(self, count: int) -> None:
+        self.parts: dict[str, Poses] = {}
+        self._count = count
+
+    @property
+    def missing(self) -> int:
+        """Number of poses that are missing."""
+        return self._count - sum(len(part) for part in self.parts.values())
+
+    def add(self, kind: str, poses: Poses) -> None:
+        """Add poses to those of their kind."""
+        if not len(poses):
+            return
+        before = [self.parts[kind]] if kind in self.parts else []
+        self.parts[kind] = Poses.joined([*before, poses])
 
 
 def _plan_auto(survey: Survey, count: int) -> tuple[dict[str, Poses], str]:
@@ -290,62 +317,63 @@ def _plan_auto(survey: Survey, count: int) -> tuple[dict[str, Poses], str]:
     other poses stand around or above the scene as its shape allows, where it looks sharp from there. The
     remaining poses stand on the ground and wherever the scene looks sharp.
     """
+    mix = _Mix(count)
     inside = survey.inside
-    landscape = survey.site.is_landscape
-    parts: dict[str, Poses] = {}
     why = [f"{inside.share:.1%} of its box lies within rooms"]
-
-    def missing() -> int:
-        return count - sum(len(part) for part in parts.values())
-
-    def add(kind: str, poses: Poses) -> None:
-        if len(poses):
-            parts[kind] = Poses.joined([parts[kind], poses] if kind in parts else [poses])
-
-    add("inside", plan_inside(survey, round(inside.weight * count)))
-    hidden = missing() > 0 and is_hidden(survey)
-    if hidden:
+    mix.add("inside", plan_inside(survey, round(inside.weight * count)))
+    if mix.missing > 0 and is_hidden(survey):
         why.append("a ceiling hides it from around and above")
-        add("walk", plan_walk(survey, missing(), indoors=True))
-        add("walk", plan_walk(survey, missing()))
-        add("sharp", plan_sharp(survey, missing()))
-    if missing() and not hidden:
-        kind = "aerial" if landscape else "orbit"
-        why.append("a landscape" if landscape else "an object")
-        sharp = _see_sharply(survey, _PLANNERS[kind](survey, missing(), first=_SAMPLED))
-        share = float(sharp.mean()) if len(sharp) else 1.0
-        far = _PLANNERS[kind](survey, missing(), first=None if share >= _FEW else 0)
-        if share < _FEW:
-            why.append(f"from around or above it looks blurred ({share:.0%} of the poses are sharp)")
-        elif share < _MOST:
+        mix.add("walk", plan_walk(survey, mix.missing, indoors=True))
+        mix.add("walk", plan_walk(survey, mix.missing))
+        mix.add("sharp", plan_sharp(survey, mix.missing))
+    elif mix.missing:
+        why += _add_from_outside(survey, mix)
+    for kind in sorted(("aerial", "orbit"), key=lambda kind: kind not in mix.parts):
+        if mix.missing:  # rather hidden or foggy views than too few
+            mix.add(kind, _PLANNERS[kind](survey, mix.missing, 1))
+    return mix.parts, "; ".join(why)
+
+
+def _add_from_outside(survey: Survey, mix: _Mix) -> list[str]:
+    """Add poses around or above a scene that look sharp, and others within it; return the reasons."""
+    landscape = survey.site.is_landscape
+    kind = "aerial" if landscape else "orbit"
+    why = ["a landscape" if landscape else "an object"]
+    plan = _PLANNERS[kind]
+    sharp = _see_sharply(survey, plan(survey, mix.missing, first=_SAMPLED))
+    share = float(sharp.mean()) if len(sharp) else 1.0
+    if share < _FEW:
+        why.append(f"from around or above it looks blurred ({share:.0%} of the poses are sharp)")
+        far = Poses.joined([])
+    else:
+        far = plan(survey, mix.missing)
+        if share < _MOST:
             far = far.take(_see_sharply(survey, far))
-        if share >= _FEW and (landscape or is_room(survey)):
-            add("walk", plan_walk(survey, round((_STREET if landscape else 1.0) * missing())))
-        add(kind, far.take(slice(missing())))
-        if missing():
-            add("sharp", plan_sharp(survey, missing(), also=plan_walk(survey, missing() // 2, 1)))
-        if missing() and share < _FEW:
-            add("walk", plan_walk(survey, missing(), 2))
-    for kind in sorted(("aerial", "orbit"), key=lambda kind: kind not in parts):
-        if missing():  # rather hidden or foggy views than too few
-            add(kind, _PLANNERS[kind](survey, missing(), 1))
-    return parts, "; ".join(why)
+        if landscape or is_room(survey):
+            walks = _STREET if landscape else 1.0
+            mix.add("walk", plan_walk(survey, round(walks * mix.missing)))
+    mix.add(kind, far.take(slice(mix.missing)))
+    if mix.missing:
+        walk = plan_walk(survey, mix.missing // 2, 1)
+        mix.add("sharp", plan_sharp(survey, mix.missing, also=walk))
+    if mix.missing and share < _FEW:
+        mix.add("walk", plan_walk(survey, mix.missing, 2))
+    return why
 
 
 def _see_sharply(survey: Survey, poses: Poses) -> Mask:
     """Return whether each pose sees the scene sharply; matter behind the scene does not count."""
     site = survey.site
     away = norms(poses.eyes - site.box.mean(axis=0))
-    reach = away + norms(site.box[1:] - site.box[:1]) / 2
+    reach = away + site.diagonal / 2
     usual = float(middle(site.grid.scale_at(site.points)))  # unweighted: a sky has few rows and much area
-    coarse = survey.glance.of(survey.cameras(poses), site.size * reach)[2]
-    return coarse < np.maximum(_SHARP, _SHARP_IN_SCALES * usual / np.maximum(away, np.finfo(float).tiny))
+    _, _, coarse = survey.glance.of(survey.cameras(poses), site.size * reach)
+    return coarse < np.maximum(_SHARP, _SHARP_IN_SCALES * usual / positive(away))
 
 
 def _measure_share_held(survey: Survey, poses: Poses) -> float:
     """Return the share of the scene's matter that a typical pose has in its frame."""
     if not len(poses):
         return 1.0
-    site = survey.site
-    points = site.origin + site.size * (site.points[:_POINTS] @ site.axes)
+    points = survey.site.globalize(survey.site.points[:_POINTS])
     return max(survey.cameras(poses).usual_share(points), 1 / _POINTS)

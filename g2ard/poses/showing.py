@@ -116,13 +116,13 @@ class Outlook:
     @classmethod
     def of(cls, survey: Survey, cameras: Cameras, full: float = -1.0) -> Outlook:
         """Look through the views, whose covered share to the power of `full` counts."""
-        site = survey.site
         glance = survey.outlook
-        points = (glance.points - site.origin) @ site.axes.T / site.size
-        mass = glance.opacities * ((points > site.box[0]) & (points < site.box[1])).all(axis=1)
+        within = survey.site.encloses(survey.site.localize(glance.points))
+        mass = glance.opacities * within
         covered, sharp, detail, spread, seen = glance.sights(cameras)
         seen *= (mass / max(float(mass.sum()), 1e-9)).astype(np.float32)
-        return cls(cameras, seen, sharp * np.maximum(covered, 1e-9) ** full, detail, spread)
+        clear = sharp * np.maximum(covered, 1e-9) ** full
+        return cls(cameras, seen, clear, detail, spread)
 
 
 def _look_from_outside(survey: Survey, every: int = 1) -> Outlook:
@@ -133,17 +133,19 @@ def _look_from_outside(survey: Survey, every: int = 1) -> Outlook:
 def _look_from_within(survey: Survey, every: int = 1) -> Outlook:
     """Return views at eye level within a scene; there are fewer if `every` is more than 1."""
     wide = replace(survey, lens=Lens(survey.lens.size, WIDE))
-    poses = Poses.joined([plan(wide, _STANDING // every) for plan in (plan_inside, plan_walk, plan_sharp)])
-    level = poses.take((poses.gazes[:, 2] > _GAZES[0]) & (poses.gazes[:, 2] < _GAZES[1]))
+    count = _STANDING // every
+    poses = Poses.joined([plan_inside(wide, count), plan_walk(wide, count), plan_sharp(wide, count)])
+    pitch = poses.gazes[:, 2]
+    level = poses.take((pitch > _GAZES[0]) & (pitch < _GAZES[1]))
     return Outlook.of(survey, wide.cameras(level), _FULL)
 
 
 def is_hidden(survey: Survey) -> bool:
     """Return whether views from around see little of what clear views within do, as above a ceiling, or show
     below a pixel what walls surround."""
-    return is_walled(survey) or (
-        _is_roofed(survey) and _sees_less(_look_from_outside(survey, 2), _look_from_within(survey, 2))
-    )
+    if is_walled(survey):
+        return True
+    return _is_roofed(survey) and _sees_less(_look_from_outside(survey, 2), _look_from_within(survey, 2))
 
 
 def _is_roofed(survey: Survey) -> bool:
@@ -163,8 +165,7 @@ def is_walled(survey: Survey) -> bool:
     if site.terrain is None:
         return False
     at = halton(0, _PLACES, 3, 1)
-    places = between(site.box, at)
-    places[:, 2] = site.ground(places) + site.tallness * between(_HEIGHTS, at[:, 2])
+    places = site.place_at(at, site.tallness * between(_HEIGHTS, at[:, 2]))
     places = places[site.is_free(places, 2)]
     within = places[closed(site, places, 24, -_HORIZON, _HORIZON) > _WALLED]
     if len(within) <= len(places) / 2:
@@ -176,21 +177,24 @@ def is_walled(survey: Survey) -> bool:
 
 def _sees_less(around: Outlook, within: Outlook) -> bool:
     seen = around.seen.max(axis=0, initial=0.0)
-    both = within.seen[within.clear > _GOOD].max(axis=0, initial=0.0)
-    return bool(seen.sum(dtype=np.float64) < _OPEN * np.maximum(seen, both).sum(dtype=np.float64))
+    seen_within = within.seen[within.clear > _GOOD].max(axis=0, initial=0.0)
+    both = np.maximum(seen, seen_within)
+    return bool(seen.sum(dtype=np.float64) < _OPEN * both.sum(dtype=np.float64))
 
 
 def _plan_looks(survey: Survey) -> tuple[Outlook, str]:
     """Return views that show a scene "within" it, planned only if it may be shown so, or from "around"."""
     around = _look_from_outside(survey)
-    room = is_room(survey)
     blurred = around.clear.sum() <= _CRISP * len(around.cameras)
-    room = room or (not blurred and is_walled(survey))
-    if room or blurred or _is_roofed(survey):
-        within = _look_from_within(survey)
-        good = within.clear.max(initial=0.0) > _GOOD
-        if len(within.cameras) and (room or (good and (blurred or _sees_less(around, within)))):
-            return within, "within"
+    room = is_room(survey) or (not blurred and is_walled(survey))
+    if not (room or blurred or _is_roofed(survey)):
+        return around, "around"
+    within = _look_from_within(survey)
+    if not len(within.cameras):
+        return around, "around"
+    good = within.clear.max(initial=0.0) > _GOOD
+    if room or (good and (blurred or _sees_less(around, within))):
+        return within, "within"
     return around, "around"
 
 
@@ -241,24 +245,39 @@ def turntable(
     best, kind = _find_best(survey, 1, cameras and cameras.usual())
     site = survey.site
     first = best[0]
-    angles = 2 * np.pi * np.arange(count) / count
-    eye = (first.position - site.origin) @ site.axes.T / site.size
+    eye = site.localize(first.position)
     gaze = best.forwards[0] @ site.axes.T
-    away = 0.0
+    angles = 2 * np.pi * np.arange(count) / count
+    away = 0.0  # from the eye to the axis of the turn
     if kind == "photos":
         assert cameras is not None
-        points = survey.outlook.points
-        middle = points[first.outward(points) < _MIDDLE]
-        away = (
-            float(np.median((middle - first.position) @ best.forwards[0])) / site.size if len(middle) else 0.0
-        )
-        eyes = turned((cameras.positions - site.origin) / site.size, site.axes) - (eye + away * gaze)
-        angles = _turn_within_arc(angles, np.arctan2(eyes[:, 1], eyes[:, 0]) - np.arctan2(-gaze[1], -gaze[0]))
+        away = _measure_subject_distance(survey, best)
+        eyes = turned((cameras.positions - site.origin) / site.size, site.axes)
+        offsets = eyes - (eye + away * gaze)
+        photo_angles = np.arctan2(offsets[:, 1], offsets[:, 0])
+        angles = _turn_within_arc(angles, photo_angles - np.arctan2(-gaze[1], -gaze[0]))
     gazes = around(gaze, angles)
-    poses = circle(survey, gazes) if kind == "around" else Poses(eye + away * (gaze - gazes), gazes)
-    half = max(first.width / first.K[0, 0], first.height / first.K[1, 1] * size[0] / size[1]) / 2
-    views = replace(survey, lens=Lens(size, 2 * float(np.degrees(np.arctan(half))))).cameras(poses)
+    if kind == "around":
+        poses = circle(survey, gazes)
+    else:
+        poses = Poses(eye + away * (gaze - gazes), gazes)
+    across = first.width / first.K[0, 0]
+    down = first.height / first.K[1, 1]
+    half = max(across, down * size[0] / size[1]) / 2  # tangent of half the field of view
+    lens = Lens(size, 2 * float(np.degrees(np.arctan(half))))
+    views = replace(survey, lens=lens).cameras(poses)
     return replace(views, names=tuple(f"{i:04d}" for i in range(count))), site.axes[2]
+
+
+def _measure_subject_distance(survey: Survey, best: Cameras) -> float:
+    """Return the median depth of what the first view has in the middle, in site units; 0 without any."""
+    first = best[0]
+    points = survey.outlook.points
+    middle = points[first.outward(points) < _MIDDLE]
+    if not len(middle):
+        return 0.0
+    depths = (middle - first.position) @ best.forwards[0]
+    return float(np.median(depths)) / survey.site.size
 
 
 def _turn_within_arc(angles: Float, seen: Float) -> Float:
@@ -272,13 +291,14 @@ def _turn_within_arc(angles: Float, seen: Float) -> Float:
     widest = int(np.argmax(gaps))
     if gaps[widest] < _GAP:
         return angles
-    low = order[widest] + gaps[widest] - 2 * np.pi
     high = order[widest]
-    return np.where(np.sin(angles) > 0, high, -low) * np.sin(angles)
+    low = high + gaps[widest] - 2 * np.pi
+    swing = np.sin(angles)
+    return np.where(swing > 0, high, -low) * swing
 
 
 def _create_survey(splats: Splats, size: tuple[int, int], axis: ArrayLike | None) -> Survey:
-    rows = np.flatnonzero(splats.opacities > 1 / 255)
+    rows = splats.visible_rows()
     some = splats.take(rows[canonical_order(splats, rows, _ROWS)])
     represents = len(rows) / max(1, len(some))
     some = some.take(some.finite_rows()) if len(some) else some
@@ -289,9 +309,8 @@ def _find_best(survey: Survey, count: int, cameras: Cameras | None) -> tuple[Cam
     """Return the best views, and where they are: "photos", "within" or "around"."""
     if cameras is not None:
         look = Outlook.of(survey, take_evenly(cameras, _PHOTOS))
-        return look.cameras.take(
-            _choose(look, look.detail * _measure_wholeness(survey, look), count)
-        ), "photos"
+        worth = look.detail * _measure_wholeness(survey, look)
+        return look.cameras.take(_choose(look, worth, count)), "photos"
     look, kind = _plan_looks(survey)
     worth = look.detail if kind == "within" else look.detail * look.spread
     found = look.cameras.take(_choose(look, worth, count))
@@ -302,11 +321,14 @@ def _find_best(survey: Survey, count: int, cameras: Cameras | None) -> tuple[Cam
 
 def _measure_wholeness(survey: Survey, look: Outlook) -> Float:
     """Return (V,) how much photos show of their subject, which most have in the middle, and how whole."""
+    # From 0 in the middle of the image to 1 at its edge, (V, N).
     outward = np.stack([camera.outward(survey.outlook.points) for camera in look.cameras])
-    middle = (look.seen * np.exp(-np.square(outward / _MIDDLE) / 2)).mean(axis=0)
-    share = np.sqrt(middle / np.maximum(look.seen.max(axis=0), 1e-30))
+    centrality = np.exp(-np.square(outward / _MIDDLE) / 2)
+    middle = (look.seen * centrality).mean(axis=0)
+    share = np.sqrt(middle / np.maximum(look.seen.max(axis=0), 1e-30))  # of the subject, per Gaussian
     shown = (look.seen * share).sum(axis=1)
-    within = (np.clip((1 - outward) / _EDGE, 0, 1) * middle * share).sum(axis=1)
+    uncut = np.clip((1 - outward) / _EDGE, 0, 1)
+    within = (uncut * middle * share).sum(axis=1)
     within /= max(float((middle * share).sum()), 1e-30)
     return shown / max(float(shown.max()), 1e-30) * within**_UNCUT
 
@@ -317,9 +339,9 @@ def _choose(look: Outlook, worth: Float, count: int) -> list[int]:
     worth = np.where(clear >= _CLEAR * clear.max(initial=0), worth * clear, 0.0)
     total = look.seen.sum(axis=1, dtype=np.float64)
     forwards = look.cameras.forwards
-    least = np.full(len(total), np.inf)
+    least = np.full(len(total), np.inf)  # degrees to the nearest chosen view
     union = np.zeros_like(look.seen[:1])
-    chosen = list[int]()
+    chosen: list[int] = []
     while len(chosen) < min(count, len(total)):
         new = np.maximum(look.seen - union, 0).sum(axis=1, dtype=np.float64)
         value = worth * (new + _AGAIN * total) * np.minimum(1, least / _APART)
@@ -328,6 +350,9 @@ def _choose(look: Outlook, worth: Float, count: int) -> list[int]:
             break
         chosen.append(best)
         union = np.maximum(union, look.seen[best])
-        least = np.minimum(least, np.degrees(np.arccos(np.clip(forwards @ forwards[best], -1, 1))))
+        cosines = np.clip(forwards @ forwards[best], -1, 1)
+        least = np.minimum(least, np.degrees(np.arccos(cosines)))
         worth[best] = 0
-    return chosen or [0][: len(total)]
+    if not chosen and len(total):
+        return [0]
+    return chosen

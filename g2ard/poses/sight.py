@@ -16,7 +16,7 @@ from g2ard.poses.site import Inside, Site
 from g2ard.poses.votes import Votes
 from g2ard.rendering.renderer import RasterSettings, View, view_of
 from g2ard.scene.cameras import Cameras
-from g2ard.scene.reproducible import canonical_order, norms, quantile, turned
+from g2ard.scene.reproducible import canonical_order, norms, positive, quantile, turned
 from g2ard.scene.splats import Splats
 from g2ard.system.cached import cached_property
 
@@ -83,12 +83,21 @@ class Lens:
         half = float(np.tan(np.radians(self.fov) / 2))
         return half, half * self.size[1] / self.size[0]
 
+    def holds(self, x: Float, y: Float, z: Float) -> Mask:
+        """Return (M,) whether points, right, down and ahead of the eye, are in the frame."""
+        wide, tall = self.tangents
+        return (z > 0) & (np.abs(x) < wide * z) & (np.abs(y) < tall * z)
+
+    @property
+    def focal(self) -> float:
+        """Focal length in pixels."""
+        return self.size[0] / 2 / self.tangents[0]
+
     @property
     def matrix(self) -> Float:
         """(3, 3) pinhole intrinsics in pixels."""
         width, height = self.size
-        focal = width / 2 / self.tangents[0]
-        return np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
+        return np.array([[self.focal, 0, width / 2], [0, self.focal, height / 2], [0, 0, 1]])
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,30 +141,30 @@ class Glance:
     """
 
     def __init__(self, splats: Splats, represents: float = 1.0, limit: int = _ROWS) -> None:
-        rows = np.flatnonzero(splats.opacities > 1 / 255)
+        rows = splats.visible_rows()
         some = rows[canonical_order(splats, rows, limit)]
         sample = splats.take(some[splats.take(some).finite_rows()])
         scales = np.sort(sample.scales.astype(np.float64), axis=1)
         self.sizes = np.sqrt(scales[:, 1] * scales[:, 2])
+        self.opacities = sample.opacities
         self._middle = sample.offset + np.median(sample.means.astype(np.float64), axis=0)
-        means = sample.positions - self._middle
-        most = _MOST_WIDENED * limit / _ROWS
-        widen = min(most, np.sqrt(represents * len(rows) / max(1, len(some))))
-        shortest = np.arange(3) == np.argmin(sample.scales, axis=1)[:, None]
-        logs = np.log(np.maximum(sample.scales, np.finfo(np.float32).tiny))
-        self._means = means
+        self._means = sample.positions - self._middle
+        self.points = self._means + self._middle
         self._antialiased = sample.antialiased
         self._colors = np.clip(sample.colors.astype(np.float64), 0, 1)
-        self.points = means + self._middle
-        self.opacities = sample.opacities
-        self._arrays: tuple[Float32, ...] = (
-            np.ascontiguousarray(means, np.float32),
-            np.ascontiguousarray(sample.quats, np.float32),
-            np.ascontiguousarray(np.where(shortest, logs, logs + np.log(widen)), np.float32),
-            np.ascontiguousarray(np.clip(sample.logit_opacities, -80, 80), np.float32),
-            np.ascontiguousarray(sample.sh0, np.float32),
-            np.zeros((len(means), 0, 3), np.float32),
+        most = _MOST_WIDENED * limit / _ROWS
+        widen = min(most, np.sqrt(represents * len(rows) / max(1, len(some))))
+        is_shortest = np.arange(3) == np.argmin(sample.scales, axis=1)[:, None]
+        logs = np.log(np.maximum(sample.scales, np.finfo(np.float32).tiny))
+        arrays = (
+            self._means,
+            sample.quats,
+            np.where(is_shortest, logs, logs + np.log(widen)),
+            np.clip(sample.logit_opacities, -80, 80),
+            sample.sh0,
+            np.zeros((len(self._means), 0, 3)),
         )
+        self._arrays = tuple(np.ascontiguousarray(array, np.float32) for array in arrays)
 
     def of(self, cameras: Cameras, reach: Float | None = None) -> Float:
         """Look through C cameras, and measure how much matter each sees, and how sharply.
@@ -168,17 +177,22 @@ class Glance:
         figures = np.zeros((3, len(cameras)))
         for i, (sums, depth, view) in enumerate(self._renders(cameras, self._near_of(cameras))):
             weight = sums["weight"] / np.prod(view[2])
-            seen = (weight > 0) & (depth <= (np.inf if reach is None else reach[i]))
+            farthest = np.inf if reach is None else reach[i]
+            seen = (weight > 0) & (depth <= farthest)
             figures[:, i] = weight.sum(), 0.0, np.inf
             if seen.any():
-                angle = self.sizes[seen] / np.maximum(depth[seen], np.finfo(float).tiny)
-                fine = weight[seen][angle < _FINE].sum()
-                figures[1:, i] = fine, quantile(angle, weight[seen], _COARSEST)
+                angle = self.sizes[seen] / positive(depth[seen])
+                seen_weight = weight[seen]
+                figures[1, i] = seen_weight[angle < _FINE].sum()
+                figures[2, i] = quantile(angle, seen_weight, _COARSEST)
         return figures
 
     def _near_of(self, cameras: Cameras) -> float | None:
+        """Return a near plane in proportion to how far the cameras stand; None leaves it to the renderer."""
+        if not len(cameras):
+            return None
         away = norms(cameras.positions - self._middle)
-        return 1e-3 * float(np.median(away)) or None if len(cameras) else None
+        return 1e-3 * float(np.median(away)) or None
 
     def sights(self, cameras: Cameras) -> tuple[Float, Float, Float, Float, Float32]:
         """Look through C cameras, and tell what each sees of every Gaussian.
@@ -196,11 +210,13 @@ class Glance:
         for i, (sums, depth, view) in enumerate(self._renders(cameras, near)):
             image = np.clip(rasterizer.image(self._arrays, view, settings, list(BLACK)), 0, 1)
             weight = sums["weight"] / image[..., 0].size
-            covered[i], fine[i] = weight.sum(), weight[self.sizes < _FINE * depth].sum()
+            covered[i] = weight.sum()
+            fine[i] = weight[self.sizes < _FINE * depth].sum()
             seen[i] = sums["transmittance"] / np.maximum(1, sums["hits"])
             detail[i] = sum(np.abs(np.diff(image, axis=axis)).mean(dtype=np.float64) for axis in (0, 1))
             shown = sums["weight"].astype(np.float64)
-            spread[i] = np.sqrt(sum(_measure_variance(channel, shown) for channel in self._colors.T))
+            variances = [_measure_variance(channel, shown) for channel in self._colors.T]
+            spread[i] = np.sqrt(sum(variances))
         return covered, fine, detail, spread, seen
 
     def clear(self, cameras: Cameras, aims: Int, close: float) -> Float:
@@ -210,17 +226,18 @@ class Glance:
             aims: (C,) rows of `points` in the middle.
             close: distance within which matter is close, scene units.
         """
-        renders = self._renders(cameras, _NEAR * close, crop=True)
-        found = [
-            sums["transmittance"][aim] / max(1, sums["hits"][aim])
-            for aim, (sums, _, _) in zip(aims, renders, strict=True)
-        ]
-        return np.array(found, np.float64)
+        found = np.zeros(len(cameras))
+        for i, (sums, _, _) in enumerate(self._renders(cameras, _NEAR * close, crop=True)):
+            aim = aims[i]
+            found[i] = sums["transmittance"][aim] / max(1, sums["hits"][aim])
+        return found
 
     def murk(self, cameras: Cameras, close: float) -> Float:
         """Return the (C,) shares of the images that show matter nearer than `close`, scene units."""
-        renders = self._renders(cameras, _NEAR * close)
-        return np.array([sums["weight"][depth < close].sum() / np.prod(v[2]) for sums, depth, v in renders])
+        shares = np.zeros(len(cameras))
+        for i, (sums, depth, view) in enumerate(self._renders(cameras, _NEAR * close)):
+            shares[i] = sums["weight"][depth < close].sum() / np.prod(view[2])
+        return shares
 
     def _renders(
         self, cameras: Cameras, near: float | None, crop: bool = False
@@ -231,13 +248,16 @@ class Glance:
         here = cameras.resized(_LONGEST).recentred(self._middle)
         if crop:
             sizes = np.stack([here.widths, here.heights], axis=1)
-            here = here.cropped(np.maximum(0, (sizes - _CROP) // 2), np.minimum(sizes, (sizes + _CROP) // 2))
+            low = np.maximum(0, (sizes - _CROP) // 2)
+            high = np.minimum(sizes, (sizes + _CROP) // 2)
+            here = here.cropped(low, high)
         settings = RasterSettings(antialiased=self._antialiased, near=near)
         for first in range(0, len(here), _BATCH):
             batch = range(first, min(first + _BATCH, len(here)))
             views = [view_of(here, i, settings) for i in batch]
-            for i, sums in zip(batch, _core.accumulate_each(self._arrays, views, settings), strict=True):
-                yield sums, norms(self._means - here.positions[i]), views[i - first]
+            results = _core.accumulate_each(self._arrays, views, settings)
+            for i, view, sums in zip(batch, views, results, strict=True):
+                yield sums, norms(self._means - here.positions[i]), view
 
 
 def _measure_variance(values: Float, weights: Float) -> float:
@@ -291,19 +311,18 @@ class Survey:
 
     def cameras(self, poses: Poses) -> Cameras:
         """Return cameras in world coordinates, named in order."""
-        site = self.site
-        lens = self.lens
-        digits = max(4, len(str(len(poses) - 1)))
-        turned = poses.frames() @ site.axes
-        eyes = site.origin + site.size * (poses.eyes @ site.axes)
-        viewmats = np.tile(np.eye(4), (len(poses), 1, 1))
-        viewmats[:, :3, :3] = turned
-        viewmats[:, :3, 3] = -np.einsum("pij,pj->pi", turned, eyes)
+        count = len(poses)
+        digits = max(4, len(str(count - 1)))
+        rotations = poses.frames() @ self.site.axes
+        eyes = self.site.globalize(poses.eyes)
+        viewmats = np.tile(np.eye(4), (count, 1, 1))
+        viewmats[:, :3, :3] = rotations
+        viewmats[:, :3, 3] = -np.einsum("pij,pj->pi", rotations, eyes)
         return Cameras.from_lists(
             list(viewmats),
-            [lens.matrix] * len(poses),
-            [lens.size] * len(poses),
-            [f"pose_{i:0{digits}d}" for i in range(len(poses))],
+            [self.lens.matrix] * count,
+            [self.lens.size] * count,
+            [f"pose_{i:0{digits}d}" for i in range(count)],
         )
 
 
@@ -311,7 +330,8 @@ class Rays:
     """A coarse frame of rays from each of P poses, and what they meet in the site's grid, as (P,) arrays."""
 
     def __init__(self, survey: Survey, poses: Poses) -> None:
-        (wide, tall), (columns, rows) = survey.lens.tangents, _RAYS
+        wide, tall = survey.lens.tangents
+        columns, rows = _RAYS
         x = wide * ((np.arange(columns) + 0.5) / columns * 2 - 1)
         y = tall * ((np.arange(rows) + 0.5) / rows * 2 - 1)
         rays = np.stack([np.tile(x, rows), np.repeat(y, columns), np.ones(columns * rows)], axis=1)
@@ -369,14 +389,20 @@ def gather(
             at least 1 is good.
         patience: candidates tried per requested pose, at most.
     """
-    parts = [(Poses.joined([]), np.zeros(0))]
+    parts = [Poses.joined([])]
+    scores = np.zeros(0)
     asked = 0
-    while (good := sum(int((scores >= 1).sum()) for _, scores in parts)) < count and asked < patience * count:
+    good = 0
+    while good < count and asked < patience * count:
         more = min(max(count - good, 16), patience * count - asked, _BLOCK)
-        parts.append(tried(asked, asked + more))
+        poses, judged = tried(asked, asked + more)
+        parts.append(poses)
+        scores = np.concatenate([scores, judged])
         asked += more
         survey.tell(min(good, count - 1), count)
+        good = int((scores >= 1).sum())
     survey.tell(count, count)
-    score = np.minimum(np.concatenate([scores for _, scores in parts]), 1.0)
-    best = np.argsort(-score, kind="stable")[:count]
-    return Poses.joined([poses for poses, _ in parts]).take(np.sort(best[score[best] >= _TOLERABLE]))
+    scores = np.minimum(scores, 1.0)
+    best = np.argsort(-scores, kind="stable")[:count]
+    usable = best[scores[best] >= _TOLERABLE]
+    return Poses.joined(parts).take(np.sort(usable))

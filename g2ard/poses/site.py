@@ -19,6 +19,7 @@ from g2ard.scene.reproducible import (
     moments,
     norms,
     quantile,
+    quantiles,
     turned,
 )
 from g2ard.scene.splats import Splats
@@ -30,8 +31,11 @@ _EXTENT = (0.01, 0.99)
 _BODY = 1.5
 """Least half side of the box, in standard deviations of a typical Gaussian: some scenes are only one."""
 
-_MARGIN = (0.1, 0.02)
-"""Margin of the grid around the box: a share of its sides, plus a length in scene sizes."""
+_MARGIN_SHARE = 0.1
+"""Margin of the grid around the box, as a share of its sides."""
+
+_MARGIN = 0.02
+"""Addition to this margin, in scene sizes."""
 
 _BELOW_SKY = 0.9
 """Share of the distance to a sky within which poses stand."""
@@ -68,7 +72,7 @@ the hollow of an object .13 and more."""
 _MOSTLY = 0.75
 """Share of the matter seen that this least asks of."""
 
-_ROOMS = (0.005, 0.025)
+_ROOM_SHARES = (0.005, 0.025)
 """Share of the box that lies within rooms: below the first no pose stands inside, from the second on all do,
 or `_SHELL` of them in a scene without ground. Measured: showroom .026–.079, objects and open scenes 0.000."""
 
@@ -140,34 +144,62 @@ class Site:
         matter = Matter.of(splats, rows, represents)
         some = matter.first()
         axis = splats.up if axis is None else axis
-        found = estimate_up(some) if axis is None else given_up(some, axis)
-        axes = _choose_axes(some, found.axis)
+        vertical = estimate_up(some) if axis is None else given_up(some, axis)
+        axes = _choose_axes(some, vertical.axis)
         points = turned(some.points, axes)
-        box = np.array([quantile(points[:, a], some.weights, _EXTENT) for a in range(3)]).T
-        missing = np.maximum(0, _BODY * middle(matter.scales[:, 2]) - (box[1] - box[0]) / 2)
+        box = quantiles(points, some.weights, _EXTENT).T
+        half_sides = (box[1] - box[0]) / 2
+        missing = np.maximum(0, _BODY * middle(matter.scales[:, 2]) - half_sides)
         box += missing * np.array([[-1.0], [1.0]])
-        margin = _MARGIN[0] * (box[1] - box[0]) + _MARGIN[1]
-        grid = Grid.of(box[0] - margin, box[1] + margin, matter, axes)
-        ground = facing(some, found.axis)
-        terrain = Terrain.of(points[ground], some.weights[ground], box) if found.grounded else None
-        origin = splats.offset + matter.origin
-        body = 2 * float(missing.min())  # a Gaussian is drawn as far as three standard deviations
+        margin = _MARGIN_SHARE * (box[1] - box[0]) + _MARGIN
+        terrain = None
+        if vertical.grounded:
+            ground = facing(some, vertical.axis)
+            terrain = Terrain.of(points[ground], some.weights[ground], box)
         return cls(
             points=points,
             weights=some.weights,
             box=box,
-            body=body,
+            body=2 * float(missing.min()),  # a Gaussian is drawn as far as three standard deviations
             terrain=terrain,
-            grid=grid,
+            grid=Grid.of(box[0] - margin, box[1] + margin, matter, axes),
             axes=axes,
-            origin=origin,
+            origin=splats.offset + matter.origin,
             size=matter.size,
-            vertical=found,
+            vertical=vertical,
             beyond=turned(matter.beyond, axes),
             beyond_share=matter.beyond_share,
             centre=turned(matter.centre[None], axes)[0],
             horizon=matter.horizon,
         )
+
+    @property
+    def sides(self) -> Float:
+        """(3,) lengths of the box."""
+        return self.box[1] - self.box[0]
+
+    @property
+    def diagonal(self) -> float:
+        """Length of the box's diagonal."""
+        return float(norms(self.box[1:] - self.box[:1])[0])
+
+    def encloses(self, points: Float) -> Mask:
+        """Return (M,) whether points lie in the box."""
+        return ((points > self.box[0]) & (points < self.box[1])).all(axis=1)
+
+    def place_at(self, shares: Float, heights: Float) -> Float:
+        """Return (M, 3) places at (M, 3) shares of the box, and at heights above the ground."""
+        places = between(self.box, shares)
+        places[:, 2] = self.ground(places) + heights
+        return places
+
+    def localize(self, points: Float) -> Float:
+        """Return (M, 3) world points in the site's coordinates."""
+        return (points - self.origin) @ self.axes.T / self.size
+
+    def globalize(self, points: Float) -> Float:
+        """Return (M, 3) points in world coordinates."""
+        return self.origin + self.size * (points @ self.axes)
 
     def ground(self, points: Float) -> Float:
         """Return (M,) heights of the ground under points, or of the box's bottom without a ground."""
@@ -183,41 +215,46 @@ class Site:
 
     def is_free(self, points: Float, cells: float, above: float = -np.inf) -> Mask:
         """Return whether points are over `cells` cells from matter, `above` the ground and below a sky."""
-        free = (self.grid.distance(points) > cells * self.grid.cell) & (self.above_ground(points) > above)
+        free = self.grid.distance(points) > cells * self.grid.cell
+        free &= self.above_ground(points) > above
         return free & (norms(points - self.centre) < _BELOW_SKY * self.horizon)
 
     @cached_property
     def tallness(self) -> float:
         """Height of what stands on the ground: the `_TALL` quantile of the matter's height above it."""
-        return max(float(quantile(self.points[:, 2] - self.ground(self.points), self.weights, _TALL)), 0.0)
+        heights = self.points[:, 2] - self.ground(self.points)
+        return max(float(quantile(heights, self.weights, _TALL)), 0.0)
 
     @cached_property
     def is_landscape(self) -> bool:
         """Whether the scene has a ground and is much wider than high."""
-        wide, deep, tall = self.box[1] - self.box[0]
+        wide, deep, tall = self.sides
         return self.terrain is not None and bool(tall < _FLAT * np.sqrt(wide * deep))
 
     def met(self, points: Float, ways: Float) -> Float:
         """Return (M, D) distances from each point to matter in each of D directions; inf without any."""
         eyes = np.repeat(points, len(ways), axis=0)
-        return self.grid.cast(eyes, np.tile(ways, (len(points), 1))).reshape(len(points), len(ways))
+        directions = np.tile(ways, (len(points), 1))
+        return self.grid.cast(eyes, directions).reshape(len(points), len(ways))
 
     def inside(self, seed: int) -> Inside:
         """Find free places around which matter covers most of the sphere and looks sharp."""
         places = between(self.box, halton(0, _TRIES, 3, seed))
         places = places[self.is_free(places, 2)]
         ways = fibonacci(_DIRECTIONS)
-        distances = self.met(places, ways)
+        distances = self.met(places, ways)  # (places, ways)
         at, way = np.nonzero(np.isfinite(distances))
         met = distances[at, way]
-        scales = self.grid.scale_at(places[at] + (met + 0.5 * self.grid.cell)[:, None] * ways[way])
-        sharp = np.bincount(at[scales < _SHARP * met], minlength=len(places)) / _DIRECTIONS
-        around = np.bincount(at, minlength=len(places)) / _DIRECTIONS
-        places = places[(around > _ENCLOSED) & (sharp > _MOSTLY * around)]
+        just_within = met + 0.5 * self.grid.cell
+        scales = self.grid.scale_at(places[at] + just_within[:, None] * ways[way])
+        is_sharp = scales < _SHARP * met
+        sharp = np.bincount(at[is_sharp], minlength=len(places)) / _DIRECTIONS
+        enclosed = np.bincount(at, minlength=len(places)) / _DIRECTIONS
+        places = places[(enclosed > _ENCLOSED) & (sharp > _MOSTLY * enclosed)]
         places = places[np.argsort(-self.grid.distance(places), kind="stable")]
         share = len(places) / _TRIES
-        weight = float(np.interp(share, _ROOMS, (0.0, 1.0 if self.vertical.grounded else _SHELL)))
-        return Inside(places, share, weight)
+        most = 1.0 if self.vertical.grounded else _SHELL
+        return Inside(places, share, float(np.interp(share, _ROOM_SHARES, (0.0, most))))
 
 
 def _choose_axes(some: Matter, axis: Float) -> Float:
@@ -229,9 +266,11 @@ def _choose_axes(some: Matter, axis: Float) -> Float:
     weights = some.weights / some.weights.sum()
     flat = np.stack([along(some.points, ahead), along(some.points, left)], axis=1)
     flat -= (weights[:, None] * flat).sum(axis=0)
-    values, vectors = np.linalg.eigh(moments(flat, weights))
-    if values[1] > _LONG * values[0]:
-        x, y = vectors[:, 1] * np.copysign(1.0, vectors[np.argmax(np.abs(vectors[:, 1])), 1])
+    variances, vectors = np.linalg.eigh(moments(flat, weights))
+    if variances[1] > _LONG * variances[0]:
+        longest = vectors[:, 1]
+        sign = np.copysign(1.0, longest[np.argmax(np.abs(longest))])  # solvers return either direction
+        x, y = longest * sign
         ahead = x * ahead + y * left
     return np.stack([ahead, np.cross(axis, ahead), axis])
 
@@ -250,24 +289,26 @@ class Terrain:
 
         Points, (M, 3) with mass (M,), are the matter that faces up or down; the box is the scene's.
         """
-        sides = np.maximum(box[1, :2] - box[0, :2], 1e-6)
+        low = box[0, :2]
+        sides = np.maximum(box[1, :2] - low, 1e-6)
         block = float(sides.max()) / _BLOCKS
         shape = np.maximum(1, np.ceil(sides / block - 1e-9)).astype(int)
-        place = np.floor((points[:, :2] - box[0, :2]) / block).astype(int)
+        place = np.floor((points[:, :2] - low) / block).astype(int)
         inside = ((place >= 0) & (place < shape)).all(axis=1)
         block_of = np.where(inside, place[:, 0] * shape[1] + place[:, 1], -1)
         heights = np.full(int(np.prod(shape)), np.nan)
         order = np.argsort(block_of, kind="stable")
         found, firsts = np.unique(block_of[order], return_index=True)
-        for k, first, end in zip(found, firsts, [*firsts[1:], len(order)], strict=False):
-            if k >= 0:
-                rows = order[first:end]
-                heights[k] = quantile(points[rows, 2], weights[rows], _LOW)
+        for number, rows in zip(found, np.split(order, firsts[1:]), strict=False):
+            if number >= 0:
+                heights[number] = quantile(points[rows, 2], weights[rows], _LOW)
         heights = _fill(heights.reshape(shape), box[0, 2])
+        # A morphological opening removes bumps narrower than three blocks; then blocks are smoothed.
         lowest = _stack_neighbours(heights, np.inf).min(axis=0)
-        opened = _stack_neighbours(lowest, -np.inf).max(axis=0)  # without bumps narrower than three blocks
+        opened = _stack_neighbours(lowest, -np.inf).max(axis=0)
         padded = np.pad(opened, 1, mode="edge")
-        return cls(box[0, :2], block, _stack_neighbours(padded, 0.0).mean(axis=0)[1:-1, 1:-1])
+        smooth = _stack_neighbours(padded, 0.0).mean(axis=0)[1:-1, 1:-1]
+        return cls(low, block, smooth)
 
     def height(self, points: Float) -> Float:
         """Return (M,) ground heights under points: bilinear within the map, constant beyond its edge."""
@@ -278,7 +319,8 @@ class Terrain:
         total = np.zeros(len(points))
         for step in ((0, 0), (0, 1), (1, 0), (1, 1)):
             x, y = np.minimum(base + step, top).T
-            total += np.where(step, share, 1 - share).prod(axis=1) * self.heights[x, y]
+            weights = np.where(step, share, 1 - share).prod(axis=1)
+            total += weights * self.heights[x, y]
         return total
 
 
@@ -286,10 +328,11 @@ def _fill(heights: Float, default: float) -> Float:
     """Fill gaps with the mean of their neighbours, ring by ring."""
     if np.isnan(heights).all():
         return np.full_like(heights, default)
-    while (gaps := np.isnan(heights)).any():
+    while np.isnan(heights).any():
         around = _stack_neighbours(heights, np.nan)
         count = (~np.isnan(around)).sum(axis=0)
-        heights = np.where(gaps & (count > 0), np.nansum(around, axis=0) / np.maximum(count, 1), heights)
+        means = np.nansum(around, axis=0) / np.maximum(count, 1)
+        heights = np.where(np.isnan(heights) & (count > 0), means, heights)
     return heights
 
 

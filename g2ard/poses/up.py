@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from g2ard.arrays import Float, Mask
+from g2ard.arrays import Float, Mask, Values
 from g2ard.poses.matter import Matter
-from g2ard.scene.reproducible import along, fibonacci, moments, quantile
+from g2ard.scene.reproducible import along, fibonacci, moments, positive, quantile
 from g2ard.scene.transform import unit_up
 
 _FACING = np.cos(np.radians(20))
@@ -17,6 +18,12 @@ _FACING = np.cos(np.radians(20))
 
 _SLOPED = np.cos(np.radians(35))
 """The same on ground, which may have slopes."""
+
+_UPRIGHT = np.cos(np.radians(15))
+"""Least cosine between an axis and a coordinate axis that it is taken for."""
+
+_USUAL_SIGNS = (1.0, -1.0, 1.0)
+"""Signs of up along x, y and z in most files: y is down, z is up."""
 
 _SHEET = 0.08
 """Ratio of the scene's smallest variance over its middle one below which it is flat like terrain."""
@@ -61,7 +68,8 @@ def given_up(sample: Matter, direction: ArrayLike) -> Up:
         InputError: not three finite numbers, or all zero.
     """
     axis = unit_up(direction)
-    return Up(axis, _is_flat(sample)[0] or _find_layer(sample, axis)[0] > _GROUND_GIVEN, "up as given")
+    grounded = _find_shape(sample).is_flat or _find_layer(sample, axis).share > _GROUND_GIVEN
+    return Up(axis, grounded, "up as given")
 
 
 def estimate_up(sample: Matter) -> Up:
@@ -71,28 +79,32 @@ def estimate_up(sample: Matter) -> Up:
     of the matter is the ground; layers that are much stronger than those across them are floors; a long
     object stands on its end. Otherwise the axis is y, as in most capture software.
     """
-    flat, thin, long = _is_flat(sample)
-    if flat:
-        return _choose_sign(
-            sample, _mean_normal(sample, thin, facing(sample, thin)), True, "the scene is flat"
-        )
+    shape = _find_shape(sample)
+    if shape.is_flat:
+        axis = _mean_normal(sample, shape.thinnest, facing(sample, shape.thinnest))
+        return _choose_sign(sample, axis, True, "the scene is flat")
     few = sample.first(_SEARCHED)
     directions = np.concatenate([np.eye(3), fibonacci(600)[:300]])
-    shares, _, edges = np.array([_find_layer(few, axis) for axis in directions]).T
-    axis = directions[int(np.argmax(edges * [_favour_habit(axis) for axis in directions]))]
+    layers = [_find_layer(few, axis) for axis in directions]
+    edges = np.array([layer.edge for layer in layers])
+    shares = np.array([layer.share for layer in layers])
+    favours = [_favour_habit(axis) for axis in directions]
+    axis = directions[int(np.argmax(edges * favours))]
     for _ in range(3):
-        inside = np.abs(along(sample.points, axis) - _find_layer(sample, axis)[1]) < 2 * _SLAB
+        heights = along(sample.points, axis)
+        inside = np.abs(heights - _find_layer(sample, axis).height) < 2 * _SLAB
         axis = _mean_normal(sample, axis, inside & facing(sample, axis, _FACING))
-    if _find_layer(sample, axis)[2] > _GROUND:
+    if _find_layer(sample, axis).edge > _GROUND:
         return _choose_sign(sample, axis, True, "a ground plane")
     axis = directions[int(np.argmax(shares))]
     across = shares[np.abs(directions @ axis) < 0.5].max()
     axis = _mean_normal(sample, axis, facing(sample, axis, _FACING))
     if shares.max() > _LAYERED * across and _favour_habit(axis) > 1:
         return _choose_sign(sample, axis, True, "its layers face that way")
-    if long is not None:
-        usual = np.eye(3)[int(np.argmax(np.abs(long)))]  # long objects lean, files are upright
-        axis = usual if abs(long @ usual) > np.cos(np.radians(15)) else long
+    if shape.longest is not None:
+        usual = np.eye(3)[int(np.argmax(np.abs(shape.longest)))]  # long objects lean, files are upright
+        is_usual = abs(shape.longest @ usual) > _UPRIGHT
+        axis = usual if is_usual else shape.longest
         return _choose_sign(sample, axis, False, "no ground; the long axis")
     return _choose_sign(sample, np.array([0.0, -1.0, 0.0]), False, "no ground; a guess")
 
@@ -102,70 +114,96 @@ def facing(sample: Matter, axis: Float, least: float = _SLOPED) -> Mask:
     return np.abs(along(sample.normals, axis)) > least
 
 
-def _is_flat(sample: Matter) -> tuple[bool, Float, Float | None]:
-    """Return whether the scene is flat, its thinnest axis, and its longest axis if the scene is long."""
-    w = sample.weights / sample.weights.sum()
-    centred = sample.points - (w[:, None] * sample.points).sum(axis=0)
-    values, vectors = np.linalg.eigh(moments(centred, w))
-    long = vectors[:, 2] if values[2] > _ROD * values[1] else None
-    return bool(values[0] < _SHEET * values[1]), vectors[:, 0], long
+class _Shape(NamedTuple):
+    """Whether a scene is flat, its thinnest axis, and its longest axis if the scene is long."""
+
+    is_flat: bool
+    thinnest: Float
+    longest: Float | None
 
 
-def _find_layer(sample: Matter, axis: Float) -> tuple[float, float, float]:
-    """Return the strongest layer that faces `axis`: its share of all matter, its height, and its edge.
+def _find_shape(sample: Matter) -> _Shape:
+    weights = sample.weights / sample.weights.sum()
+    centred = sample.points - (weights[:, None] * sample.points).sum(axis=0)
+    variances, vectors = np.linalg.eigh(moments(centred, weights))  # ascending
+    is_long = variances[2] > _ROD * variances[1]
+    return _Shape(
+        is_flat=bool(variances[0] < _SHEET * variances[1]),
+        thinnest=vectors[:, 0],
+        longest=vectors[:, 2] if is_long else None,
+    )
 
-    The edge is the share, reduced by matter on both sides: ground and walls have it on one side.
+
+class _Layer(NamedTuple):
+    """A layer of matter that faces an axis.
+
+    Args:
+        share: its share of all matter.
+        height: along the axis.
+        edge: the share, reduced by matter on both sides: ground and walls have it on one side.
     """
+
+    share: float
+    height: float
+    edge: float
+
+
+def _find_layer(sample: Matter, axis: Float) -> _Layer:
+    """Return the strongest layer that faces `axis`."""
     rows = facing(sample, axis, _FACING)
     if not rows.any():
-        return 0.0, 0.0, 0.0
+        return _Layer(0.0, 0.0, 0.0)
     heights = along(sample.points, axis)
     total = sample.weights.sum()
     bins = np.floor(heights[rows] / _SLAB).astype(int)
     low = bins.min()
     mass = np.bincount(bins - low, sample.faces[rows])
-    pairs = mass + np.append(mass[1:], 0.0)
+    pairs = mass + np.append(mass[1:], 0.0)  # a layer may lie across two bins
     best = int(np.argmax(pairs))
     share = pairs[best] / total
     height = (low + best + 1) * _SLAB
     above = sample.weights[heights - height > 2 * _SLAB].sum()
     below = sample.weights[heights - height < -2 * _SLAB].sum()
-    edge = share * (1 - 2 * min(above, below) / max(above + below, 0.05 * total))
-    return float(share), float(height), float(edge)
+    both_sides = 2 * min(above, below) / max(above + below, 0.05 * total)
+    return _Layer(float(share), float(height), float(share * (1 - both_sides)))
 
 
 def _favour_habit(axis: Float) -> float:
     """Return a factor that favours y and z, the up axes of nearly every file, over other directions."""
-    return 1.2 if np.abs(axis[1:]).max() > np.cos(np.radians(15)) else 1.0
+    return 1.2 if np.abs(axis[1:]).max() > _UPRIGHT else 1.0
 
 
 def _mean_normal(sample: Matter, axis: Float, rows: Mask) -> Float:
+    """Return the mean normal of some rows, whose signs are arbitrary, on the side of `axis`."""
     weights = sample.faces[rows]
     if not weights.sum() > 0:
         return axis
-    mean: Float = np.linalg.eigh(moments(sample.normals[rows], weights))[1][:, 2]
+    _, vectors = np.linalg.eigh(moments(sample.normals[rows], weights))
+    mean: Float = vectors[:, 2]
     return mean * np.copysign(1.0, mean @ axis)
 
 
 def _choose_sign(sample: Matter, axis: Float, grounded: bool, why: str) -> Up:
     """Turn the axis to where the matter is on its ground, or away from an object's heavier end."""
     heights = along(sample.points, axis)
-    ends = quantile(heights, sample.weights, [0.01, 0.99])
-    lean = (
-        _measure_lean(sample, axis, heights) if grounded else _measure_lowness(heights, sample.weights, *ends)
-    )
+    if grounded:
+        lean = _measure_lean(sample, axis, heights)
+        side = "most of the scene lies above it"
+    else:
+        low, high = quantile(heights, sample.weights, [0.01, 0.99])
+        lean = _measure_lowness(heights, sample.weights, low, high)
+        side = "its heavier end is down"
     if abs(lean) > _UNSURE:
-        side = "most of the scene lies above it" if grounded else "its heavier end is down"
         return Up(axis * np.copysign(1.0, lean), grounded, f"{why}, {side}")
     largest = int(np.argmax(np.abs(axis)))
-    sign = np.copysign(1.0, (1.0, -1.0, 1.0)[largest] * axis[largest])
+    sign = np.copysign(1.0, _USUAL_SIGNS[largest] * axis[largest])
     return Up(axis * sign, grounded, f"{why}, its sign by custom")
 
 
 def _measure_lowness(heights: Float, weights: Float, low: float, high: float) -> float:
     """Return how low the mean height lies from `high`, −1, to `low`, 1."""
     mean = (weights * heights).sum() / weights.sum()
-    return float(1 - 2 * (mean - low) / max(high - low, np.finfo(float).tiny))
+    return float(1 - 2 * (mean - low) / positive(high - low))
 
 
 def _measure_lean(sample: Matter, axis: Float, heights: Float) -> float:
@@ -183,17 +221,23 @@ def _measure_lean(sample: Matter, axis: Float, heights: Float) -> float:
         layers = [faces[np.abs(heights[flat] - end) < 2 * _SLAB].sum() for end in (low, high)]
         if high - low >= 6 * _SLAB and min(layers) > 0.25 * faces.sum():
             between = (heights > low + 2 * _SLAB) & (heights < high - 2 * _SLAB)
-            empty = not weights[between].sum() > 0
-            if empty:
+            if not weights[between].sum() > 0:
                 return 0.0
             return _measure_lowness(heights[between], weights[between], low, high)
+    column = _number_columns(sample.points, axis)
+    above = np.zeros(len(heights))
+    for number in np.unique(column):
+        rows = column == number
+        ground = rows & flat
+        if not ground.any():
+            ground = rows
+        above[rows] = heights[rows] - quantile(heights[ground], weights[ground], 0.5)
+    return float((weights * above).sum() / positive((weights * np.abs(above)).sum()))
+
+
+def _number_columns(points: Float, axis: Float) -> Values:
+    """Return (M,) numbers of 6×6 columns along an axis that points lie in."""
     first = np.cross(axis, np.eye(3)[int(np.argmin(np.abs(axis)))])
     first /= np.linalg.norm(first)
-    sides = [np.floor(3 + 3 * along(sample.points, a)) for a in (first, np.cross(axis, first))]
-    column = (6, 1) @ np.clip(sides, 0, 5)
-    above = np.zeros(len(heights))
-    for cell in np.unique(column):
-        rows = column == cell
-        ground = rows & flat if (rows & flat).any() else rows
-        above[rows] = heights[rows] - quantile(heights[ground], weights[ground], 0.5)
-    return float((weights * above).sum() / max((weights * np.abs(above)).sum(), np.finfo(float).tiny))
+    sides = [np.floor(3 + 3 * along(points, across)) for across in (first, np.cross(axis, first))]
+    return (6, 1) @ np.clip(sides, 0, 5)

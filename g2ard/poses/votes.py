@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from g2ard.arrays import Float, Mask
-from g2ard.scene.reproducible import along, directions, fibonacci, halton, middle, norms, quantile
+from g2ard.scene.reproducible import along, directions, fibonacci, halton, middle, norms, positive, quantile
 from g2ard.system.cached import cached_property
 
 _FOCAL = 858.0
@@ -58,9 +58,12 @@ _LEAST = 0.05
 _LOST = 0.05
 """Largest share of the scene that lies beyond and is below a pixel from around what is near."""
 
-_WORSE = (1.5, 0.01)
-"""Factor on the share that is lost, and addition to it, with which a wider hypothesis is as good. A limit on
-the difference alone would let a sky of nine tenths of the rows decide."""
+_WORSE_FACTOR = 1.5
+"""Factor on the share that is lost with which a wider hypothesis is as good. A limit on the difference alone
+would let a sky of nine tenths of the rows decide."""
+
+_WORSE = 0.01
+"""Addition to this share."""
 
 _CLOSED = 0.3
 """Share of the directions that a sky fills: half of a dome and more."""
@@ -88,13 +91,16 @@ class Votes:
     @classmethod
     def of(cls, points: Float, sizes: Float, opacities: Float, represents: float = 1.0) -> Votes:
         """Let the first `_VOTERS` rows vote, of which each row stands for some Gaussians."""
-        some = slice(_VOTERS)
-        represents *= len(points) / len(points[some])
+        count = len(points)
+        points = points[:_VOTERS]
+        sizes = sizes[:_VOTERS]
+        opacities = opacities[:_VOTERS]
+        represents *= count / len(points)
         return cls(
-            points=points[some],
-            reach=_FOCAL * sizes[some],
-            weights=opacities[some] / max(float(opacities[some].sum()), 1e-30),
-            faces=represents * 2 * np.pi * np.square(sizes[some]) * opacities[some],
+            points=points,
+            reach=_FOCAL * sizes,
+            weights=opacities / max(float(opacities.sum()), 1e-30),
+            faces=represents * 2 * np.pi * np.square(sizes) * opacities,
         )
 
     def at(self, places: Float) -> Float:
@@ -112,17 +118,19 @@ class Votes:
         """
         which, far, turn, height = halton(0, _PLACES, 4, 0).T
         rows = (which * len(self.points)).astype(int)
-        level = np.sqrt(1 - np.square(2 * height - 1))
-        places = self.points[rows]
-        places = places + (self.reach[rows] * far**_CLOSE)[:, None] * directions(turn, level, 2 * height - 1)
+        z = 2 * height - 1
+        ways = directions(turn, np.sqrt(1 - np.square(z)), z)  # even on the sphere
+        away = self.reach[rows] * far**_CLOSE
+        places = self.points[rows] + away[:, None] * ways
         votes = self.at(places)
         best = places[votes >= votes.max() - _WINNING]
-        away = np.array([self._log_distance(place) for place in best])
-        order = np.argsort(away, kind="stable")
-        return middle(best[order[: max(1, round(_CENTRAL * len(best)))]])
+        logs = np.array([self._log_distance(place) for place in best])
+        order = np.argsort(logs, kind="stable")
+        central = max(1, round(_CENTRAL * len(best)))
+        return middle(best[order[:central]])
 
     def _log_distance(self, place: Float) -> float:
-        distances = np.maximum(norms(self.points - place), np.finfo(float).tiny)
+        distances = positive(norms(self.points - place))
         return float((self.weights * np.log(distances)).sum())
 
     @cached_property
@@ -140,12 +148,12 @@ class Votes:
         a pixel, or behind a sky.
         """
         gaps = self._gaps()
-        losses = {
-            radius: float((1 - self.at(self._around(radius))).mean()) + self._hidden(gaps, radius)
-            for radius in [*gaps, np.inf]
-            if self._lost_beyond(radius) <= _LOST
-        }
-        most = _WORSE[0] * min(losses.values()) + _WORSE[1]
+        losses: dict[float, float] = {}
+        for radius in [*gaps, np.inf]:
+            if self._lost_beyond(radius) <= _LOST:
+                below_a_pixel = float((1 - self.at(self._around(radius))).mean())
+                losses[radius] = below_a_pixel + self._hidden(gaps, radius)
+        most = _WORSE_FACTOR * min(losses.values()) + _WORSE
         return max(radius for radius, loss in losses.items() if loss <= most)
 
     @cached_property
@@ -158,32 +166,37 @@ class Votes:
 
     def _hidden(self, gaps: list[float], radius: float) -> float:
         """Return the largest share of the scene that a sky within a radius surrounds and hides."""
-        shells = [gap for gap in gaps if gap < radius]
-        inside = [float(self.weights[self.distances <= gap].sum()) for gap in shells]
-        return max((a * self._closed(gap) for a, gap in zip(inside, shells, strict=True)), default=0.0)
+        largest = 0.0
+        for gap in gaps:
+            if gap < radius:
+                inside = float(self.weights[self.distances <= gap].sum())
+                largest = max(largest, inside * self._closed(gap))
+        return largest
 
     def _closed(self, radius: float) -> float:
         """Return the share of the directions from `centre` in which matter beyond a radius stops light."""
         beyond = self.distances > radius
         away = self.points[beyond] - self.centre
-        faces = self.faces[beyond]
-        angles = faces / np.square(self.distances[beyond])
-        way = np.argmax(np.stack([along(away, axis) for axis in _WAYS]), axis=0)
-        depth = np.bincount(way, weights=angles, minlength=len(_WAYS)) * len(_WAYS) / (4 * np.pi)
+        angles = self.faces[beyond] / np.square(self.distances[beyond])  # solid angles
+        cosines = np.stack([along(away, axis) for axis in _WAYS])
+        nearest_way = np.argmax(cosines, axis=0)
+        total = np.bincount(nearest_way, weights=angles, minlength=len(_WAYS))
+        depth = total * len(_WAYS) / (4 * np.pi)  # optical depth along each way
         return float((1 - np.exp(-depth)).mean())
 
     def _gaps(self) -> list[float]:
         """Return the distances at which gaps begin."""
-        distances = self.distances
-        order = np.argsort(distances, kind="stable")
-        far = distances[order]
+        order = np.argsort(self.distances, kind="stable")
+        far = self.distances[order]
         total = np.append(0.0, np.cumsum(self.weights[order]))
+        upto = total[1:]  # the weight up to each row
         beyond = np.searchsorted(far, _GAP * far, side="right")
-        empty = total[beyond] - total[1:] < _EMPTY
-        empty &= total[1:] > _LEAST  # the first rows are few anywhere
+        empty = total[beyond] - upto < _EMPTY
+        empty &= upto > _LEAST  # the first rows are few anywhere
         empty[: _FEWEST - 1] = False
         empty[beyond == len(far)] = False  # nothing lies beyond the gap
-        return far[empty & ~np.append(empty[1:], False)].tolist()
+        is_last = ~np.append(empty[1:], False)  # a gap begins at the last row before it
+        return far[empty & is_last].tolist()
 
     def _around(self, radius: float) -> Float:
         """Return places around what is within a radius, from which it fits the frame."""
@@ -194,4 +207,5 @@ class Votes:
     def _lost_beyond(self, radius: float) -> float:
         """Return the share of the scene that lies beyond a radius and covers no pixel from around it."""
         beyond = self.distances > radius
-        return float(np.mean([self.weights[beyond & ~self._sees(eye)].sum() for eye in self._around(radius)]))
+        lost = [self.weights[beyond & ~self._sees(eye)].sum() for eye in self._around(radius)]
+        return float(np.mean(lost))

@@ -2,14 +2,39 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from g2ard.arrays import Float, Int, Mask
 from g2ard.poses.sight import SIGHT_ROWS, Glance, Poses, Rays, Survey, gather
 from g2ard.poses.site import Site
-from g2ard.scene.reproducible import between, directions, fibonacci, halton, joined, norms, turned
+from g2ard.scene.reproducible import (
+    between,
+    directions_at,
+    fibonacci,
+    halton,
+    joined,
+    normalized,
+    norms,
+    turned,
+)
 
-Reach = tuple[Int, Float, Mask]
+
+@dataclass(frozen=True, eq=False)
+class Reach:
+    """The nearest pose that sees each of K points.
+
+    Args:
+        nearest: (K,) indices of the poses, −1 if none sees the point.
+        distances: (K,) distances from them, inf if none sees the point.
+        coarse: (K,) whether a point is seen, but with a standard deviation below a pixel.
+    """
+
+    nearest: Int
+    distances: Float
+    coarse: Mask
+
 
 _ROOM_PITCHES = (-0.3, 0.2)
 """Range of gaze pitches above the horizon in rooms, in radians."""
@@ -117,26 +142,24 @@ def is_room(survey: Survey) -> bool:
     return survey.inside.weight > _MOSTLY_INSIDE
 
 
-def _direct_gazes(turn: Float, rise: Float) -> Float:
-    return directions(turn, np.cos(rise), np.sin(rise))
-
-
 def plan_inside(survey: Survey, count: int) -> Poses:
     """Plan at most `count` poses within rooms, gazing all around and near the horizon.
 
     Every second pose stands where there is most clearance. Gazes into a near wall, or out of the scene, are
     dropped.
     """
-    site = survey.site
     places = survey.inside.places
     wide = max(1, int(_WIDE * len(places)))
+    clear = _CLEAR_CELLS * survey.site.grid.cell
 
     def tried(start: int, stop: int) -> tuple[Poses, Float]:
         at, turn, pitch = halton(start, stop, 3, survey.seed + 1).T
-        reach = np.where(np.arange(start, stop) % 2 == 0, wide, len(places))
-        poses = Poses(places[(at * reach).astype(int)], _direct_gazes(turn, between(_ROOM_PITCHES, pitch)))
+        is_even = np.arange(start, stop) % 2 == 0
+        choices = np.where(is_even, wide, len(places))
+        gazes = directions_at(turn, between(_ROOM_PITCHES, pitch))
+        poses = Poses(places[(at * choices).astype(int)], gazes)
         seen = Rays(survey, poses)
-        return poses, np.minimum(seen.covered / _COVERED, seen.close / (_CLEAR_CELLS * site.grid.cell))
+        return poses, np.minimum(seen.covered / _COVERED, seen.close / clear)
 
     return gather(survey, count if len(places) else 0, tried)
 
@@ -150,14 +173,12 @@ def plan_walk(survey: Survey, count: int, shift: int = 0, *, indoors: bool | Non
     site = survey.site
     room_like = is_room(survey)
     indoors = room_like if indoors is None else indoors
-    heights = _UNDER_A_DOME if indoors and not room_like else _EYES[indoors]
-    sides = site.box[1] - site.box[0]
-    tall = sides[2] if indoors else site.tallness
-    far = 0.4 * min(sides[:2]) if indoors else 0.6 * tall
+    tall = site.sides[2] if indoors else site.tallness
+    far = 0.4 * min(site.sides[:2]) if indoors else 0.6 * tall
     room = max(2 * site.grid.cell, 0.06 * tall)
+    heights = _UNDER_A_DOME if indoors and not room_like else _EYES[indoors]
     at = halton(0, int(np.clip(4 * count, *_TRIES)), 3, survey.seed + shift)
-    places = between(site.box, at)
-    places[:, 2] = site.ground(places) + tall * between(heights, at[:, 2])
+    places = site.place_at(at, tall * between(heights, at[:, 2]))
     places = places[site.is_free(places, room / site.grid.cell)]
     if indoors:
         places = places[closed(site, places, 64, -1.0, 0.5) > _WALLS]
@@ -168,11 +189,13 @@ def plan_walk(survey: Survey, count: int, shift: int = 0, *, indoors: bool | Non
 
     def tried(start: int, stop: int) -> tuple[Poses, Float]:
         turn, pitch = halton(start, stop, 2, survey.seed + shift + 1).T
-        gazes = _direct_gazes(turn, np.radians(between(_WALK_PITCHES, pitch)))
+        gazes = directions_at(turn, np.radians(between(_WALK_PITCHES, pitch)))
         poses = Poses(places[np.arange(start, stop) % len(places)], gazes)
         seen = Rays(survey, poses)
-        limits = [seen.covered / _FRAME[indoors], seen.close / (2 * room), seen.median / far]
-        return poses, np.min(limits if indoors else [*limits, seen.standing / _THINGS], axis=0)
+        scores = [seen.covered / _FRAME[indoors], seen.close / (2 * room), seen.median / far]
+        if not indoors:
+            scores.append(seen.standing / _THINGS)
+        return poses, np.min(scores, axis=0)
 
     return gather(survey, count if len(places) else 0, tried)
 
@@ -185,15 +208,17 @@ def closed(site: Site, points: Float, rays: int, low: float, high: float) -> Flo
 def _find_connected(site: Site, points: Float) -> Mask:
     """Return whether each point belongs to a large part of the graph that joins neighbours in sight."""
     count = len(points)
-    apart = sum((column[:, None] - column) ** 2 for column in points.T)
-    near = np.argsort(apart, axis=1, kind="stable")[:, 1:13]
+    squares = sum((column[:, None] - column) ** 2 for column in points.T)  # of the distances, (M, M)
+    near = np.argsort(squares, axis=1, kind="stable")[:, 1:13]  # the first is the point itself
     start = np.repeat(np.arange(count), near.shape[1])
     stop = near.ravel()
     ways = points[stop] - points[start]
     lengths = np.linalg.norm(ways, axis=1)
-    seen = site.grid.cast(points[start], ways / np.where(lengths > 0, lengths, 1.0)[:, None]) >= lengths
+    units = ways / np.where(lengths > 0, lengths, 1.0)[:, None]
+    seen = site.grid.cast(points[start], units) >= lengths
     label = joined(np.arange(count), start[seen], stop[seen])
-    return np.bincount(label, minlength=count)[label] >= max(2.0, _HALLS * count)
+    sizes = np.bincount(label, minlength=count)
+    return sizes[label] >= max(2.0, _HALLS * count)
 
 
 def plan_sharp(survey: Survey, count: int, also: Poses | None = None) -> Poses:
@@ -206,13 +231,17 @@ def plan_sharp(survey: Survey, count: int, also: Poses | None = None) -> Poses:
     def tried(start: int, stop: int) -> tuple[Poses, Float]:
         *at, turn, pitch = halton(2 * start, 2 * stop, 5, survey.seed + 2).T
         points = between(site.box, np.stack(at, axis=1))
-        free = site.is_free(points, 3)
-        poses = Poses(points[free], _direct_gazes(turn, np.radians(between(_SHARP_PITCHES, pitch)))[free])
+        gazes = directions_at(turn, np.radians(between(_SHARP_PITCHES, pitch)))
+        poses = Poses(points, gazes).take(site.is_free(points, 3))
         poses = poses.take(Rays(survey, poses).close > 4 * site.grid.cell)
         if also is not None and not start:
             poses = Poses.joined([also, poses])
         covered, fine, _ = survey.glance.of(survey.cameras(poses))
-        return poses, np.max([((covered > c) & (fine > f)) * worth for c, f, worth in _FULL], axis=0)
+        scores = np.zeros(len(poses))
+        for least_covered, least_fine, score in _FULL:
+            exceeds = (covered > least_covered) & (fine > least_fine)
+            scores = np.maximum(scores, exceeds * score)
+        return poses, scores
 
     return gather(survey, count, tried, patience=_SHARP_PATIENCE)
 
@@ -223,51 +252,47 @@ def plan_anywhere(survey: Survey, count: int) -> Poses:
     Aims are spread evenly over the scene's Gaussians, distances from 4 to 40 % of its diagonal. Rays in the
     grid reject most poses, and small renders the rest, because the grid knows neither floaters nor fog.
     """
-    site, glance = survey.site, Glance(survey.splats, survey.represents, SIGHT_ROWS)
-    diagonal = float(norms(site.box[1:] - site.box[:1])[0])
-    points = (glance.points - site.origin) @ site.axes.T / site.size
-    within = ((points > site.box[0]) & (points < site.box[1])).all(axis=1)
-    rows = np.flatnonzero(within & (glance.opacities > _SOLID))
+    site = survey.site
+    glance = Glance(survey.splats, survey.represents, SIGHT_ROWS)
+    diagonal = site.diagonal
+    close = _CLOSE * diagonal * site.size
+    points = site.localize(glance.points)
+    rows = np.flatnonzero(site.encloses(points) & (glance.opacities > _SOLID))
 
     def tried(start: int, stop: int) -> tuple[Poses, Float]:
         which, far, turn, rise = halton(start, stop, 4, survey.seed + 5).T
         aims = rows[(which * len(rows)).astype(int)]
-        gazes = -_direct_gazes(turn, np.radians(between(_RISES, rise)))
+        gazes = -directions_at(turn, np.radians(between(_RISES, rise)))
         distances = diagonal * _DISTANCES[0] * (_DISTANCES[1] / _DISTANCES[0]) ** far
         poses = Poses(points[aims] - distances[:, None] * gazes, gazes)
         free = site.grid.cast(poses.eyes, gazes) > distances - 2 * site.grid.cell
         poses = poses.take(free)
-        close = _CLOSE * diagonal * site.size
-        poses = poses.take(glance.clear(survey.cameras(poses), aims[free], close) >= _CLEAR)
-        return poses, (glance.murk(survey.cameras(poses), close) <= _MURK).astype(float)
+        clear = glance.clear(survey.cameras(poses), aims[free], close) >= _CLEAR
+        poses = poses.take(clear)
+        murk = glance.murk(survey.cameras(poses), close)
+        return poses, (murk <= _MURK).astype(float)
 
     return gather(survey, count if len(rows) else 0, tried, patience=_AIMED_PATIENCE)
 
 
 def reach_of(survey: Survey, poses: Poses) -> Reach:
-    """Find the nearest pose that sees each of the first K points of the site.
-
-    Returns:
-        (K,) indices of the poses, −1 if none sees the point; (K,) distances from them, inf if none does; and
-        (K,) whether a point is seen, but with a standard deviation below a pixel.
-    """
+    """Find the nearest pose that sees each of the first points of the site."""
     site = survey.site
-    lens = survey.lens
     points = site.points[:_SAMPLE]
     best = np.full(len(points), -1)
     nearest = np.full(len(points), np.inf)
-    wide, tall = lens.tangents
     for i, frame in enumerate(poses.frames()):
         away = points - poses.eyes[i]
         x, y, z = (away @ frame.T).T
         length = norms(away)
-        rows = np.flatnonzero((z > 0) & (np.abs(x) < wide * z) & (np.abs(y) < tall * z) & (length < nearest))
-        directions = away[rows] / length[rows, None]
-        met = site.grid.cast(np.repeat(poses.eyes[i : i + 1], len(rows), axis=0), directions)
+        rows = np.flatnonzero(survey.lens.holds(x, y, z) & (length < nearest))
+        eyes = np.repeat(poses.eyes[i : i + 1], len(rows), axis=0)
+        met = site.grid.cast(eyes, away[rows] / length[rows, None])
         rows = rows[met > length[rows] - 2 * site.grid.cell]
-        best[rows], nearest[rows] = i, length[rows]
-    coarse = site.grid.scale_at(points) * float(lens.matrix[0, 0]) < nearest
-    return best, nearest, (best >= 0) & coarse
+        best[rows] = i
+        nearest[rows] = length[rows]
+    coarse = site.grid.scale_at(points) * survey.lens.focal < nearest
+    return Reach(best, nearest, (best >= 0) & coarse)
 
 
 def plan_near(survey: Survey, poses: Poses, reach: Reach, count: int, shift: int = 0) -> Poses:
@@ -277,33 +302,31 @@ def plan_near(survey: Survey, poses: Poses, reach: Reach, count: int, shift: int
     distance. Up to half of the poses look at points that the given poses show smaller than a pixel.
     """
     site = survey.site
-    (best, distance, coarse) = reach
     chance = np.random.default_rng(survey.seed + shift)
-    small = chance.permutation(np.flatnonzero(coarse))[: count // 2]
-    others = chance.permutation(np.setdiff1d(np.flatnonzero(best >= 0), small))
+    small = chance.permutation(np.flatnonzero(reach.coarse))[: count // 2]
+    seen = np.flatnonzero(reach.nearest >= 0)
+    others = chance.permutation(np.setdiff1d(seen, small))
     rows = np.concatenate([small, others])
-    turn, rise = halton(0, len(rows), 2, survey.seed + shift + 3).T
-    eyes = poses.eyes[best[rows]]
     points = site.points[rows]
-    wanted = site.grid.scale_at(points) * float(survey.lens.matrix[0, 0]) / _PIXELS
-    share = np.clip(wanted / distance[rows], *_STEP)
-    eyes = points + share[:, None] * (eyes - points)
-    gazes = (points - eyes) / np.maximum(norms(points - eyes), np.finfo(float).tiny)[:, None]
-    gazes += _JITTER * np.stack([turn - 0.5, rise - 0.5, turn - rise], axis=1)
+    wanted = site.grid.scale_at(points) * survey.lens.focal / _PIXELS  # distances
+    share = np.clip(wanted / reach.distances[rows], *_STEP)
+    ways = poses.eyes[reach.nearest[rows]] - points
+    eyes = points + share[:, None] * ways
+    gazes = normalized(points - eyes)
+    right, up = halton(0, len(rows), 2, survey.seed + shift + 3).T
+    gazes += _JITTER * np.stack([right - 0.5, up - 0.5, right - up], axis=1)
     gazes /= norms(gazes)[:, None]
-    free = site.is_free(eyes, 2, _LOWEST)
-    near = Poses(eyes[free], gazes[free])
+    near = Poses(eyes, gazes).take(site.is_free(eyes, 2, _LOWEST))
     clear = Rays(survey, near).close > 2 * site.grid.cell
     return near.take(clear).take(slice(count))
 
 
 def framed(survey: Survey, poses: Poses, points: Float) -> Mask:
     """Return (F,) whether any pose has each point in its frame."""
-    wide, tall = survey.lens.tangents
     found = np.zeros(len(points), bool)
     for eye, frame in zip(poses.eyes, poses.frames(), strict=True):
         x, y, z = turned(points - eye, frame).T
-        found |= (z > 0) & (np.abs(x) < wide * z) & (np.abs(y) < tall * z)
+        found |= survey.lens.holds(x, y, z)
     return found
 
 
@@ -318,10 +341,13 @@ def plan_beyond(survey: Survey, poses: Poses, points: Float, count: int) -> Pose
     for aim, place in chances[:count]:
         if not len(missing):
             missing = points
-        eyes = poses.eyes[(np.arange(_OUTLOOKS) + int(place * len(poses))) % len(poses)]
-        ways = missing[int(aim * len(missing))] - eyes
+        places = (np.arange(_OUTLOOKS) + int(place * len(poses))) % len(poses)
+        eyes = poses.eyes[places]
+        target = missing[int(aim * len(missing))]
+        ways = target - eyes
         tried = Poses(eyes, ways / norms(ways)[:, None])
-        chosen = tried.take(np.argsort(Rays(survey, tried).covered, kind="stable")[:1])
+        freest = np.argsort(Rays(survey, tried).covered, kind="stable")[:1]
+        chosen = tried.take(freest)
         missing = missing[~framed(survey, chosen, missing)]
         found = Poses.joined([found, chosen])
     return found

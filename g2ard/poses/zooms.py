@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from g2ard.arrays import Float
+from g2ard.arrays import Float, Int
 from g2ard.scene.cameras import ZOOM, Camera, Cameras
 from g2ard.scene.reproducible import along, halton
 from g2ard.scene.samples import spread, take_evenly
@@ -44,20 +44,23 @@ def zoomed(scene: Splats, cameras: Cameras, *, represents: float = 1.0, share: f
     points = some.positions
     axes = np.sort(some.scales.astype(np.float64), axis=1)
     sizes = np.sqrt(axes[:, 1] * axes[:, 2] / represents)
-    small = []
+    small: list[Int] = []  # per view, the rows in sight below `_FINEST` pixels
     seen = 0
     for view in cameras:
         rows = np.flatnonzero(view.holds(points))
         depths = along(points[rows], view.viewmat[2, :3]) + view.viewmat[2, 3]
-        small.append(rows[sizes[rows] * np.sqrt(view.K[0, 0] * view.K[1, 1]) < _FINEST * depths])
+        focal = np.sqrt(view.K[0, 0] * view.K[1, 1])
+        small.append(rows[sizes[rows] * focal < _FINEST * depths])
         seen += len(rows)
-    wanted = round(share * min(_MOST, sum(map(len, small)) / (2 * max(1, seen))) * len(cameras))
+    small_share = sum(map(len, small)) / (2 * max(1, seen))
+    wanted = round(share * min(_MOST, small_share) * len(cameras))
     free = [i for i in spread(len(cameras)) if len(small[i]) and cameras.image_paths[i] is None]
     chances = halton(0, len(cameras), 3, 0)
     views = list(cameras)
     for i in free[:wanted]:
-        which, *at = chances[i]
-        views[i] = _place_window(views[i], points[small[i][int(which * len(small[i]))]], np.array(at))
+        chance, *at = chances[i]
+        row = small[i][int(chance * len(small[i]))]
+        views[i] = _place_window(views[i], points[row], np.array(at))
     return Cameras.of(views)
 
 
@@ -65,7 +68,8 @@ def _place_window(view: Camera, point: Float, at: Float) -> Camera:
     """Return the window of a view that has a point at this share of its width and height, within the view."""
     size = np.array([view.width, view.height], np.float64)
     x, y, z = view.K @ (view.viewmat[:3, :3] @ point + view.viewmat[:3, 3])
-    corner = np.clip(_TIMES * np.array([x, y]) / z - at * size, 0, (_TIMES - 1) * size)
+    pixel = _TIMES * np.array([x, y]) / z
+    corner = np.clip(pixel - at * size, 0, (_TIMES - 1) * size)
     K = view.K.copy()
     K[:2] *= _TIMES
     K[:2, 2] -= corner

@@ -5,12 +5,15 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from g2ard.arrays import Float, Int, Rows, Values
 from g2ard.scene.splats import Splats
 
 _GOLDEN = (np.sqrt(5) - 1) / 2
+"""Turn between neighbours of a Fibonacci lattice."""
+
+_TINY = np.finfo(np.float64).tiny
 
 
 def quantile(values: Float, weights: Float, shares: Any) -> Float:
@@ -23,6 +26,11 @@ def quantile(values: Float, weights: Float, shares: Any) -> Float:
     total = np.cumsum(weights[order])
     at = np.searchsorted(total, np.asarray(shares) * total[-1])
     return values[order][np.minimum(at, len(order) - 1)]
+
+
+def quantiles(points: Float, weights: Float, shares: Any) -> Float:
+    """Return `quantile` along each axis of (M, D) points: (D,), or (D, K) for K shares."""
+    return np.array([quantile(column, weights, shares) for column in points.T])
 
 
 def middle(values: Float) -> Any:
@@ -47,8 +55,16 @@ def joined(root: Int, a: Values, b: Values) -> Int:
         a = a[apart]
         b = b[apart]
         np.minimum.at(root, np.maximum(a, b), np.minimum(a, b))
-        while not np.array_equal(further := root[root], root):
-            root = further
+        root = _shorten_paths(root)
+
+
+def _shorten_paths(root: Int) -> Int:
+    """Let each row point to the root of its group rather than to another row."""
+    while True:
+        further = root[root]
+        if np.array_equal(further, root):
+            return root
+        root = further
 
 
 def along(vectors: Float, axis: Float) -> Float:
@@ -61,6 +77,16 @@ def norms(vectors: Float) -> Float:
     return np.sqrt(sum(column * column for column in vectors.T))
 
 
+def normalized(vectors: Float) -> Float:
+    """Return (M, D) rows of length 1; zero rows stay."""
+    return vectors / positive(norms(vectors))[:, None]
+
+
+def positive(values: Any) -> Any:
+    """Return values that can be divided by: the least positive number in place of zeros and negatives."""
+    return np.maximum(values, _TINY)
+
+
 def turned(vectors: Float, axes: Float) -> Float:
     """Return (M, 3) coordinates along the three rows of `axes`."""
     return np.stack([along(vectors, axis) for axis in axes], axis=1)
@@ -68,7 +94,12 @@ def turned(vectors: Float, axes: Float) -> Float:
 
 def moments(vectors: Float, weights: Float) -> Float:
     """Return the (D, D) weighted sum of outer products of (M, D) rows."""
-    return np.array([[(weights * a * b).sum() for b in vectors.T] for a in vectors.T])
+    columns = vectors.T
+    sums = np.empty((len(columns), len(columns)))
+    for i, a in enumerate(columns):
+        for j, b in enumerate(columns):
+            sums[i, j] = (weights * a * b).sum()
+    return sums
 
 
 def between(ends: Any, share: Float) -> Float:
@@ -82,8 +113,15 @@ def between(ends: Any, share: Float) -> Float:
 
 def directions(turn: Float, level: Float, height: ArrayLike) -> Float:
     """Return (M, 3) vectors at `turn` turns around z, of lengths `level` across it and `height` along it."""
-    around = 2 * np.pi * turn
-    return np.stack([level * np.cos(around), level * np.sin(around), height], axis=1)
+    angle = 2 * np.pi * turn
+    x = level * np.cos(angle)
+    y = level * np.sin(angle)
+    return np.stack([x, y, height], axis=1)
+
+
+def directions_at(turn: Float, rise: Float) -> Float:
+    """Return (M, 3) unit vectors at `turn` turns around z, `rise` radians above the horizon."""
+    return directions(turn, np.cos(rise), np.sin(rise))
 
 
 def around(vector: Float, angles: Float) -> Float:
@@ -95,7 +133,9 @@ def around(vector: Float, angles: Float) -> Float:
     x, y, z = vector
     cosine = np.cos(angles)
     sine = np.sin(angles)
-    return np.stack([x * cosine - y * sine, x * sine + y * cosine, np.full(len(angles), z)], axis=1)
+    turned_x = x * cosine - y * sine
+    turned_y = x * sine + y * cosine
+    return np.stack([turned_x, turned_y, np.full(len(angles), z)], axis=1)
 
 
 def fibonacci(count: int, low: float = -1.0, high: float = 1.0) -> Float:
@@ -105,7 +145,8 @@ def fibonacci(count: int, low: float = -1.0, high: float = 1.0) -> Float:
     """
     steps = np.arange(count)
     z = high - (high - low) * (steps + 0.5) / count
-    return directions(steps * _GOLDEN % 1, np.sqrt(1 - z * z), z)
+    turn = steps * _GOLDEN % 1
+    return directions(turn, np.sqrt(1 - z * z), z)
 
 
 def halton(start: int, stop: int, dimensions: int, seed: int) -> Float:
@@ -116,12 +157,13 @@ def halton(start: int, stop: int, dimensions: int, seed: int) -> Float:
     shift = np.random.default_rng(seed).random(dimensions)
     columns = np.empty((stop - start, dimensions))
     for column, base in zip(columns.T, (2, 3, 5, 7, 11, 13), strict=False):
+        # The digits of the index in this base, mirrored at the point.
         index = np.arange(start + 1, stop + 1)
-        share = 1.0
+        digit_worth = 1.0
         column[:] = 0
         while index.any():
-            share /= base
-            column += share * (index % base)
+            digit_worth /= base
+            column += digit_worth * (index % base)
             index = index // base
     return (columns + shift) % 1
 
@@ -138,11 +180,14 @@ def strata(features: Float, size: int, seed: int) -> Values:
     while todo:
         rows = todo.pop()
         if len(rows) <= size:
-            groups.append(np.roll(rows, int(chance.integers(len(rows)))))
+            first = int(chance.integers(len(rows)))
+            groups.append(np.roll(rows, first))
             continue
-        widest = int(np.argmax(np.ptp(features[rows], axis=0)))
+        sides = np.ptp(features[rows], axis=0)
+        widest = int(np.argmax(sides))
         rows = rows[np.argsort(features[rows, widest], kind="stable")]
-        cut = size * max(1, -(-len(rows) // size) // 2)
+        groups_inside = -(-len(rows) // size)  # rounded up
+        cut = size * max(1, groups_inside // 2)  # so that only the last group is smaller
         todo += [rows[cut:], rows[:cut]]
     return np.concatenate(groups)
 
@@ -156,19 +201,21 @@ def merge_equal(points: Float, colors: Values) -> tuple[Rows, Values]:
         points: (N, 3) relative to a point amid them.
     """
     with np.errstate(over="ignore"):
-        x, y, z = (points.astype(np.float32) + np.float32(0)).T  # -0 is 0
-    order = np.lexsort((z, y, x))
-    new = np.ones(len(points), bool)
-    new[1:] = np.any([axis[order[1:]] != axis[order[:-1]] for axis in (x, y, z)], axis=0)
+        exact = points.astype(np.float32) + np.float32(0)  # -0 is 0
+    order = np.lexsort(exact.T[::-1])  # by x, then y, then z
+    in_order = exact[order]
+    new = np.ones(len(points), bool)  # in this order, whether each differs from the one before
+    new[1:] = (in_order[1:] != in_order[:-1]).any(axis=1)
     firsts = order[new]
     if new.all():
         return np.arange(len(points)), colors
-    number = np.empty(len(firsts), np.intp)
+    number = np.empty(len(firsts), np.intp)  # of each group, by its first row
     number[np.argsort(firsts)] = np.arange(len(firsts))
     group = np.empty(len(points), np.intp)
     group[order] = number[np.cumsum(new) - 1]
     totals = [np.bincount(group, channel) for channel in colors.T]
-    return np.sort(firsts), np.stack(totals, axis=1) / np.bincount(group)[:, None]
+    counts = np.bincount(group)
+    return np.sort(firsts), np.stack(totals, axis=1) / counts[:, None]
 
 
 def canonical_order(splats: Splats, rows: Values, most: int | None = None) -> Values:
@@ -177,6 +224,24 @@ def canonical_order(splats: Splats, rows: Values, most: int | None = None) -> Va
     Moving or scaling a scene keeps the order. Sums in it do not depend on the file's row order, and a prefix
     is a random sample; only the first `most` are returned.
     """
+    key = _hash_looks(splats, rows)
+    first = np.arange(len(rows))
+    if most is not None and most < len(rows):
+        limit = np.partition(key, most)[most]
+        first = np.flatnonzero(key <= limit)
+    order = first[np.argsort(key[first])]
+    same = key[order[1:]] == key[order[:-1]]
+    tied = np.append(same, False) | np.append(False, same)
+    if tied.any():
+        among = order[tied]
+        at = rows[among]
+        columns = [*splats.scales[at].T, *splats.means[at].T[::-1], key[among]]  # the last counts first
+        order[tied] = among[np.lexsort(columns)]
+    return order[:most]
+
+
+def _hash_looks(splats: Splats, rows: Values) -> NDArray[np.uint64]:
+    """Return a hash of opacity, rotation and colour per row."""
     key = np.zeros(len(rows), np.uint64)
     for block in (splats.logit_opacities[:, None], splats.quats, splats.sh0[:, 0]):
         for column in block[rows].T:
@@ -184,15 +249,4 @@ def canonical_order(splats: Splats, rows: Values, most: int | None = None) -> Va
             key ^= bits
             key *= np.uint64(0x9E3779B97F4A7C15)
             key ^= key >> np.uint64(29)
-    first = np.arange(len(rows))
-    if most is not None and most < len(rows):
-        first = np.flatnonzero(key <= np.partition(key, most)[most])
-    order = first[np.argsort(key[first])]
-    same = key[order[1:]] == key[order[:-1]]
-    tied = np.append(same, False) | np.append(False, same)
-    if tied.any():
-        among = order[tied]
-        at = rows[among]
-        columns = [*splats.scales[at].T, *splats.means[at].T[::-1], key[among]]
-        order[tied] = among[np.lexsort(columns)]
-    return order[:most]
+    return key

@@ -24,7 +24,7 @@ def evenly_spaced(count: int, most: int, *, floor: bool = False) -> list[int]:
 
 
 class Takeable(Protocol[T_co]):
-    """Takeable that can be taken, such as Gaussians or views."""
+    """Rows that can be taken, such as Gaussians or views."""
 
     def __len__(self) -> int: ...
     def take(self, index: Int, /) -> T_co: ...

@@ -8,7 +8,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
-from g2ard.arrays import Float, Float32, Mask, Values
+from g2ard.arrays import Float, Float32, Int, Mask, Values
 from g2ard.config.choices import AXES, RENDER_MODELS, Axes, RenderModel
 from g2ard.errors import InputError, require
 from g2ard.progress import plural
@@ -241,7 +241,8 @@ class Splats(Shown):
             if np.array_equal(exact, self.means, equal_nan=True):
                 return replace(self, means=exact)
             finite = self.scales[np.isfinite(self.scales).all(1)]
-            shift = far_middle(self.means, float(np.median(finite.max(1))) if len(finite) else 0.0)
+            size = float(np.median(finite.max(1))) if len(finite) else 0.0
+            shift = far_middle(self.means, size)
             offset = self.offset + shift if shift.any() else self.offset
         moved = self.recentred(offset)
         return replace(moved, means=np.ascontiguousarray(moved.means, np.float32))
@@ -252,6 +253,10 @@ class Splats(Shown):
         for name in ("quats", "scales", "sh0", "shN"):
             ok &= np.isfinite(getattr(self, name)).reshape(len(self), -1).all(1)
         return ok
+
+    def visible_rows(self) -> Int:
+        """Return the rows whose opacity is above 1/255, which renderers draw."""
+        return np.flatnonzero(self.opacities > 1 / 255)
 
 
 class HasSplats(Protocol):
@@ -343,13 +348,13 @@ def far_middle(points: Values, size: float = 0.0) -> Float:
     if not len(sample):
         return np.zeros(3)
     low, middle, high = np.percentile(sample, (1, 50, 99), axis=0)
+    farthest = np.abs(middle).max()
     spread = float(np.linalg.norm(high - low))
-    if not (np.abs(middle) > _FAR_SPREADS * spread).any():
-        return np.zeros(3)
-    if np.spacing(np.float32(np.abs(middle).max())) <= _FINE_STEP * size:
+    is_near = not farthest > _FAR_SPREADS * spread
+    if is_near or np.spacing(np.float32(farthest)) <= _FINE_STEP * size:
         return np.zeros(3)
     unit = 2.0 ** np.floor(np.log2(spread)) if spread > 0 else 1.0
-    unit = min(1.0, max(unit, float(np.spacing(np.abs(middle).max()))))
+    unit = min(1.0, max(unit, float(np.spacing(farthest))))
     return np.rint(middle / unit) * unit
 
 
@@ -366,7 +371,9 @@ def unit_quats(quats: Float32) -> Float32:
     off = np.isfinite(lengths) & (np.abs(lengths - 1) > _UNIT_SLACK)
     if not off.any():
         return quats
+    zero = lengths == 0
+    divisors = np.where(zero, 1.0, lengths)[off]
     unit = quats.copy()
-    unit[off] = quats[off] / np.where(lengths[off] > 0, lengths[off], 1.0)[:, None]
-    unit[off & (lengths == 0)] = (1, 0, 0, 0)
+    unit[off] = quats[off] / divisors[:, None]
+    unit[zero] = (1, 0, 0, 0)
     return unit
