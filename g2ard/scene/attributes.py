@@ -47,5 +47,7 @@ def columns(splats: Splats) -> dict[str, Values]:
 
 def attribute(splats: Splats, name: str) -> Float:
     """Return the (N,) column of an attribute."""
-    names, of = next(item for item in (*_TABLE.items(), *_DERIVED.items()) if name in item[0])
-    return of(splats)[:, names.index(name)].astype(np.float64)
+    for names, read in (_TABLE | _DERIVED).items():
+        if name in names:
+            return read(splats)[:, names.index(name)].astype(np.float64)
+    raise KeyError(name)

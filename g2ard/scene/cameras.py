@@ -134,14 +134,15 @@ class Camera(Shown):
 
     def outward(self, points: ArrayLike) -> Float:
         """Return how far from the middle of the image (N, 3) world points lie: 1 at its edge, inf behind."""
-        x, y, z = self.viewmat[:3, :3] @ (np.asarray(points, np.float64) - self.position).T
-        K = self.K
+        away = np.asarray(points, np.float64) - self.position
+        x, y, z = self.viewmat[:3, :3] @ away.T
         front = z > 0
         ahead = np.where(front, z, 1.0)
-        u = K[0, 0] * x / ahead + K[0, 2]
-        v = K[1, 1] * y / ahead + K[1, 2]
-        away = np.maximum(np.abs(2 * u / self.width - 1), np.abs(2 * v / self.height - 1))
-        return np.where(front, away, np.inf)
+        u = self.K[0, 0] * x / ahead + self.K[0, 2]
+        v = self.K[1, 1] * y / ahead + self.K[1, 2]
+        across = np.abs(2 * u / self.width - 1)
+        down = np.abs(2 * v / self.height - 1)
+        return np.where(front, np.maximum(across, down), np.inf)
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,40 +184,54 @@ class Cameras(Shown):
 
     def __post_init__(self) -> None:
         n = len(self.viewmats)
-        for name, one in (("image_paths", None), ("mask_paths", None), ("lenses", None), ("kinds", USUAL)):
-            if not getattr(self, name):
-                object.__setattr__(self, name, (one,) * n)
+        for name in _TUPLE_FIELDS:
+            if name != "names" and not getattr(self, name):
+                usual = USUAL if name == "kinds" else None
+                object.__setattr__(self, name, (usual,) * n)
         if not len(self.distortions):
             object.__setattr__(self, "distortions", np.zeros((n, 5)))
         for name, shape in _ARRAY_SHAPES.items():
             got = getattr(self, name).shape
-            require(name, got, got == (n, *shape), f"shape {(n, *shape)}")
+            expected = (n, *shape)
+            require(name, got, got == expected, f"shape {expected}")
         for name in _TUPLE_FIELDS:
-            require(name, len(getattr(self, name)), len(getattr(self, name)) == n, str(n))
+            count = len(getattr(self, name))
+            require(name, count, count == n, str(n))
         if len(set(self.names)) < n:
             twice = next(name for name in self.names if self.names.count(name) > 1)
             raise InputError(f"{twice!r} is given twice; every view needs its own name", parameter="names")
+        self._check_views()
+
+    def _check_views(self) -> None:
+        """Raise an `InputError` for the first view with a fault."""
         with np.errstate(all="ignore"):  # from values that are rejected
-            scales = np.sqrt((self.viewmats[:, :3, :3] ** 2).sum((1, 2)) / 3)  # 1 in a rigid transform
+            squares = (self.viewmats[:, :3, :3] ** 2).sum((1, 2))
+            scales = np.sqrt(squares / 3)  # 1 in a rigid transform
             faults = self._faults(scales)
-        wrong = np.array(list(faults.values()))
-        if wrong.any():
-            i = int(wrong.any(0).argmax())
-            fault = list(faults)[int(wrong[:, i].argmax())]
-            size = {"width": int(self.widths[i]), "height": int(self.heights[i]), "limit": LARGEST_IMAGE}
-            message = fault.format(scale=scales[i], **size)
-            raise InputError(f"({self.names[i]}) {message}", index=i, item="view")
+        wrong = np.array(list(faults.values()))  # (faults, C)
+        if not wrong.any():
+            return
+        i = int(wrong.any(0).argmax())
+        message = list(faults)[int(wrong[:, i].argmax())].format(
+            scale=scales[i],
+            width=int(self.widths[i]),
+            height=int(self.heights[i]),
+            limit=LARGEST_IMAGE,
+        )
+        raise InputError(f"({self.names[i]}) {message}", index=i, item="view")
 
     def _faults(self, scales: Float) -> dict[str, Mask]:
         """Return the (C,) mask of each fault, the most basic first; keys are templates of messages."""
         n = len(self)
-        rotations = self.viewmats[:, :3, :3]
         values = np.hstack([self.viewmats.reshape(n, 16), self.Ks.reshape(n, 9), self.distortions])
         largest = np.abs(values).max(1)
         last_row = np.abs(self.viewmats[:, 3] - (0, 0, 0, 1)).max(1)
-        square = rotations @ rotations.transpose(0, 2, 1)
+        rotations = self.viewmats[:, :3, :3]
+        square = rotations @ rotations.transpose(0, 2, 1)  # the unit matrix times s²
         unit = scales**2
         skew = np.abs(square - unit[:, None, None] * np.eye(3)).max((1, 2))
+        pixels = self.widths.astype(np.float64) * self.heights
+        focals = self.Ks[:, [0, 1], [0, 1]]
         pose = "has a pose that {}; expected a rotation and a translation".format
         return {
             "has a pose or intrinsics that are not finite": ~np.isfinite(largest),
@@ -226,8 +241,8 @@ class Cameras(Shown):
             pose("scales by {scale:.4g}"): np.abs(scales - 1) > _POSE_SLACK,
             pose("mirrors"): np.linalg.det(rotations) < 0,
             "has an empty image, {width}×{height}": np.minimum(self.widths, self.heights) < 1,
-            _TOO_LARGE: self.widths.astype(np.float64) * self.heights > LARGEST_IMAGE,
-            "has a focal length that is not positive": (self.Ks[:, [0, 1], [0, 1]] <= 0).any(1),
+            _TOO_LARGE: pixels > LARGEST_IMAGE,
+            "has a focal length that is not positive": (focals <= 0).any(1),
         }
 
     @property
@@ -289,9 +304,8 @@ class Cameras(Shown):
     @property
     def positions(self) -> Float:
         """Camera centres in world coordinates, (C, 3)."""
-        R = self.viewmats[:, :3, :3]
-        t = self.viewmats[:, :3, 3]
-        return -np.einsum("cji,cj->ci", R, t)
+        rotations = self.viewmats[:, :3, :3]
+        return -np.einsum("cji,cj->ci", rotations, self.viewmats[:, :3, 3])
 
     @property
     def forwards(self) -> Float:
@@ -306,8 +320,10 @@ class Cameras(Shown):
         """
         if not len(self):
             return 0.0
-        away = np.linalg.norm(self.positions - self.positions.mean(0), axis=1).max()
-        return 1.1 * float(away) if away > 1e-9 * np.abs(self.positions).max() else 0.0
+        positions = self.positions
+        away = np.linalg.norm(positions - positions.mean(0), axis=1).max()
+        rounding = 1e-9 * np.abs(positions).max()
+        return 1.1 * float(away) if away > rounding else 0.0
 
     def take(self, index: ArrayLike) -> Cameras:
         """Return the views that `index` selects (a mask or indices), in its order."""
@@ -348,10 +364,12 @@ class Cameras(Shown):
     def sized(self, width: int, height: int) -> Cameras:
         """Return the views at exactly this size, each with all that it shows."""
         check_image(width, height, parameter="size")
+        across = width / self.widths
+        down = height / self.heights
         Ks = self.Ks.copy()
-        Ks[:, 0, 2] *= width / self.widths
-        Ks[:, 1, 2] *= height / self.heights
-        Ks[:, (0, 1), (0, 1)] *= np.minimum(width / self.widths, height / self.heights)[:, None]
+        Ks[:, 0, 2] *= across
+        Ks[:, 1, 2] *= down
+        Ks[:, (0, 1), (0, 1)] *= np.minimum(across, down)[:, None]
         n = len(self)
         return replace(self, Ks=Ks, widths=np.full(n, width), heights=np.full(n, height))
 
@@ -372,12 +390,14 @@ class Cameras(Shown):
         '64×48 px'
         """
         sizes = {(int(w), int(h)) for w, h in zip(self.widths, self.heights, strict=True)}
+        if not sizes:
+            return ""
         if len(sizes) == 1:
-            return "×".join(map(str, next(iter(sizes)))) + " px"
-        sides = sorted({max(size) for size in sizes})
-        if len(sides) > 1:
-            return f"{sides[0]}–{sides[-1]} px"
-        return "".join(f"{side} px" for side in sides)
+            width, height = sizes.pop()
+            return f"{width}×{height} px"
+        shortest = int(self.sides.min())
+        longest = int(self.sides.max())
+        return f"{shortest}–{longest} px" if shortest < longest else f"{longest} px"
 
     def cropped(self, low: ArrayLike, high: ArrayLike) -> Cameras:
         """Return the parts of the views from pixel `low` up to `high`, each (C, 2) or (2,), x before y.
@@ -488,18 +508,20 @@ def look_at(position: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1
     check_vector("target", target)
     check_direction("up", up)
     eye = np.asarray(position, np.float64)
+    top = np.asarray(up, np.float64)
     forward = np.asarray(target, np.float64) - eye
     length = np.linalg.norm(forward)
     if not length > 0:
         raise InputError("coincides with the position", parameter="target")
     z = forward / length
-    x = np.cross(z, np.asarray(up, np.float64))
-    if np.linalg.norm(x) < 1e-9 * np.linalg.norm(up):  # facing along `up`: any right axis works
-        x = np.cross(z, np.roll(np.asarray(up, np.float64), 1))
+    x = np.cross(z, top)
+    if np.linalg.norm(x) < 1e-9 * np.linalg.norm(top):  # facing along `up`: any right axis works
+        x = np.cross(z, np.roll(top, 1))
     x /= np.linalg.norm(x)
-    R = np.stack([x, np.cross(z, x), z])
+    rotation = np.stack([x, np.cross(z, x), z])
     view = np.eye(4)
-    view[:3, :3], view[:3, 3] = R, -R @ eye
+    view[:3, :3] = rotation
+    view[:3, 3] = -rotation @ eye
     return view
 
 

@@ -71,12 +71,21 @@ def check_condition(condition: str) -> None:
 
 _Columns = Mapping[str, Callable[[str], Values]]
 """Name → function that returns the column of this name."""
+
 _ARITHMETIC: dict[type[ast.AST], Callable[[Any, Any], Any]] = {
-    **{ast.Add: np.add, ast.Sub: np.subtract, ast.Mult: np.multiply, ast.Div: np.divide}
+    ast.Add: np.add,
+    ast.Sub: np.subtract,
+    ast.Mult: np.multiply,
+    ast.Div: np.divide,
 }
+
 _COMPARISONS: dict[type[ast.AST], Callable[[Any, Any], Any]] = {
-    **{ast.Lt: np.less, ast.LtE: np.less_equal, ast.Gt: np.greater, ast.GtE: np.greater_equal},
-    **{ast.Eq: np.equal, ast.NotEq: np.not_equal},
+    ast.Lt: np.less,
+    ast.LtE: np.less_equal,
+    ast.Gt: np.greater,
+    ast.GtE: np.greater_equal,
+    ast.Eq: np.equal,
+    ast.NotEq: np.not_equal,
 }
 _SIGNS: dict[type[ast.AST], Callable[[Any], Any]] = {ast.USub: np.negative, ast.UAdd: np.positive}
 _FUNCTIONS: dict[str, Callable[[list[Any]], Any]] = {
@@ -111,13 +120,14 @@ def _evaluate(node: ast.expr, columns: _Columns) -> Any:
             return _ARITHMETIC[type(op)](_evaluate_number(left, columns), _evaluate_number(right, columns))
         case ast.Compare(left, ops, others) if all(type(op) in _COMPARISONS for op in ops):
             values = [_evaluate_number(one, columns) for one in (left, *others)]
-            steps = zip(ops, values, values[1:], strict=False)
-            return reduce(np.logical_and, [_COMPARISONS[type(op)](a, b) for op, a, b in steps])
+            holding = []
+            for compare, a, b in zip(ops, values, values[1:], strict=False):
+                holding.append(_COMPARISONS[type(compare)](a, b))
+            return reduce(np.logical_and, holding)
         case ast.Call(ast.Name(name), arguments, []) if name in _FUNCTIONS:
-            if (len(arguments) == 1) != (name in ("abs", "sqrt")) or not arguments:
-                raise _invalid(
-                    f"{name} takes {'one number' if name in ('abs', 'sqrt') else 'several numbers'}"
-                )
+            takes_one = name in ("abs", "sqrt")
+            if not arguments or (len(arguments) == 1) != takes_one:
+                raise _invalid(f"{name} takes {'one number' if takes_one else 'several numbers'}")
             return _FUNCTIONS[name]([_evaluate_number(one, columns) for one in arguments])
         case ast.Constant(bool()):
             pass

@@ -61,17 +61,15 @@ class KdTree:
         outer = columns[self.axis][halo]
         low = np.float32(self.at - margin)
         high = np.float32(self.at + margin)
-        inside = values < np.float32(self.at)
-        left = core[inside]
-        right = core[~inside]
+        is_left = values < np.float32(self.at)
         near_left = near_right = core[:0]
         if margin > 0:
-            near_left = core[~inside & (values <= high)]
-            near_right = core[inside & (values >= low)]
+            near_left = core[~is_left & (values <= high)]
+            near_right = core[is_left & (values >= low)]
         halo_left = np.concatenate([halo[outer <= high], near_left])
         halo_right = np.concatenate([halo[outer >= low], near_right])
-        yield from self.below._route(columns, left, halo_left, margin)
-        yield from self.above._route(columns, right, halo_right, margin)
+        yield from self.below._route(columns, core[is_left], halo_left, margin)
+        yield from self.above._route(columns, core[~is_left], halo_right, margin)
 
     def refined(self, parts: dict[int, KdTree]) -> KdTree:
         """Return the tree with some leaves, by number, replaced by trees."""
@@ -111,22 +109,27 @@ def cut_tree(points: Float32, rows_each: float, most: int) -> KdTree:
     if parts == 1 or len(points) < 2:
         return KdTree()
     low, high = np.percentile(points, _BOX_PERCENTILES, axis=0)
+    sides = high - low
     spans = np.ptp(points, axis=0)
-    for axis in sorted(range(3), key=lambda a: (-(high[a] - low[a]), -spans[a], a)):
+    for axis in sorted(range(3), key=lambda a: (-sides[a], -spans[a], a)):
         values = np.sort(points[:, axis])
         at = _find_between(values, len(values) * (parts // 2) / parts)
         if at is not None:
-            inside = points[:, axis] < at
-            below, above = (cut_tree(points[side], rows_each, most) for side in (inside, ~inside))
+            is_below = points[:, axis] < at
+            below = cut_tree(points[is_below], rows_each, most)
+            above = cut_tree(points[~is_below], rows_each, most)
             return KdTree(axis, float(at), below, above)
     return KdTree()
 
 
 def parts_of(points: int, rows_each: float, most: int) -> int:
     """Return the smallest number of equal parts that are expected to hold at most `most` rows each."""
-    parts = max(1, int(np.ceil(points * rows_each / most)))
     sigmas = _SAMPLE_SIGMAS if rows_each > 1 else 0.0
-    while parts < points and (points / parts + sigmas * np.sqrt(points / parts)) * rows_each > most:
+    parts = max(1, int(np.ceil(points * rows_each / most)))
+    while parts < points:
+        points_each = points / parts
+        if (points_each + sigmas * np.sqrt(points_each)) * rows_each <= most:
+            break
         parts += 1
     return parts
 
@@ -147,12 +150,13 @@ def margin_of(tree: KdTree, points: Float32) -> float:
     """Return the margin of halos: 3 % of the tiles' median √(ab), where a and b are the longer sides."""
     if tree.leaves == 1:
         return 0.0
-    sizes = []
+    sizes: list[float] = []
     for core, _ in tree.route(points):
-        if len(core):
-            low, high = np.percentile(points[core], _BOX_PERCENTILES, axis=0)
-            sides = np.sort(high.astype(np.float64) - low)
-            sizes.append(float(np.sqrt(sides[1] * sides[2])))
+        if not len(core):
+            continue
+        low, high = np.percentile(points[core], _BOX_PERCENTILES, axis=0)
+        _, middle, longest = np.sort(high.astype(np.float64) - low)
+        sizes.append(float(np.sqrt(middle * longest)))
     return _HALO_SHARE * float(np.median(sizes)) if sizes else 0.0
 
 

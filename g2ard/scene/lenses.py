@@ -94,16 +94,20 @@ class PhotoLens:
         if self.model in _PLANAR:
             inside = across < np.tan(_find_end(self)) * z
             ahead = np.where(inside, z, 1.0)
-            u, v = self._bent(np.where(inside, x / ahead, 0.0), np.where(inside, y / ahead, 0.0))
+            u = np.where(inside, x / ahead, 0.0)
+            v = np.where(inside, y / ahead, 0.0)
         else:
             angle = np.arctan2(across, z)
             inside = angle < _find_end(self)
             away = np.where(inside, angle, 0.0)
             aim = np.where(across > 0, across, 1.0)
-            u, v = self._bent(x / aim * away, y / aim * away)
+            u = x / aim * away
+            v = y / aim * away
+        u, v = self._bent(u, v)
         cx, cy, _ = self._centre_and_rest
-        u = self.focal[0] * u + cx
-        v = self.focal[1] * v + cy
+        fx, fy = self.focal
+        u = fx * u + cx
+        v = fy * v + cy
         inside &= (u >= 0) & (u <= width) & (v >= 0) & (v <= height)
         return np.stack([u, v], 1), inside
 
@@ -112,24 +116,20 @@ class PhotoLens:
         return np.tan(angle) if self.model in _PLANAR else angle
 
     def _bent(self, u: Float, v: Float) -> tuple[Float, Float]:
+        """Distort points by the lens: radially, tangentially (p1, p2), and by a thin prism (s1, s2)."""
         _, _, rest = self._centre_and_rest
         r2 = u * u + v * v
         if self.model == "FOV":
-            r = np.sqrt(r2)
-            (omega,) = rest
-            if abs(omega) < 1e-6:
-                return u, v
-            wide = np.arctan(2 * r * np.tan(omega / 2)) / omega
-            factor = np.where(r > 1e-9, wide / np.maximum(r, 1e-9), 2 * np.tan(omega / 2) / omega)
-            return u * factor, v * factor
-        k = np.zeros(6)
+            return _bend_by_fov(u, v, r2, rest[0])
         p1 = p2 = s1 = s2 = 0.0
+        k = rest
         if self.model == "FULL_OPENCV":
-            k[:2], p1, p2, k[2:] = rest[:2], rest[2], rest[3], rest[4:]
+            k1, k2, p1, p2, *higher = rest
+            k = (k1, k2, *higher)
         elif self.model == "THIN_PRISM_FISHEYE":
-            k[:2], p1, p2, k[2:4], s1, s2 = rest[:2], rest[2], rest[3], rest[4:6], rest[6], rest[7]
-        else:
-            k[: len(rest)] = rest
+            k1, k2, p1, p2, k3, k4, s1, s2 = rest
+            k = (k1, k2, k3, k4)
+        k = (*k, *[0.0] * (6 - len(k)))
         if self.model == "FULL_OPENCV":
             above = 1 + r2 * (k[0] + r2 * (k[1] + r2 * k[2]))
             radial = above / (1 + r2 * (k[3] + r2 * (k[4] + r2 * k[5])))
@@ -140,30 +140,52 @@ class PhotoLens:
             v * radial + 2 * p2 * u * v + p1 * (r2 + 2 * v * v) + s2 * r2,
         )
 
+    def _measure_edges(self, radii: Float, angles: Float) -> Float:
+        """Return the (4,) angles of the middles of the left, right, upper and lower edge."""
+        cx, cy, _ = self._centre_and_rest
+        width, height = self.size
+        pixels = np.array([cx, width - cx, cy, height - cy])
+        return np.interp(pixels / np.repeat(self.focal, 2), radii, angles)
+
     def faces(self, scale: float = 1.0) -> list[Face]:
         """Return the pinhole views of a photo of `scale` times the size: one of a narrow lens, otherwise the
         faces of a cube that it holds enough of."""
-        size = (round(self.size[0] * scale), round(self.size[1] * scale))
         if self.model == "FULL_OPENCV":
             fx, fy, cx, cy = (scale * value for value in self.params[:4])
+            size = (round(self.size[0] * scale), round(self.size[1] * scale))
             return [("", np.eye(3), np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), size)]
         focal = scale * float(np.sqrt(self.focal[0] * self.focal[1]))
         if self.model != "EQUIRECTANGULAR":
-            cx, cy, _ = self._centre_and_rest
             angles = np.linspace(0, _find_end(self), 20001)[:-1]
             radii = np.hypot(*self._bent(self._plane_radius(angles), np.zeros(len(angles))))
-            ends = np.array([cx, self.size[0] - cx, cy, self.size[1] - cy]) / np.repeat(self.focal, 2)
-            left, right, top, bottom = np.interp(ends, radii, angles)
-            if max(left, right, top, bottom) <= _ONE_VIEW:
-                a, b, c, d = (focal * np.tan(edge) for edge in (left, right, top, bottom))
-                K = np.array([[focal, 0, a], [0, focal, c], [0, 0, 1]])
-                return [("", np.eye(3), K, (max(1, round(a + b)), max(1, round(c + d))))]
+            edges = self._measure_edges(radii, angles)
+            if edges.max() <= _ONE_VIEW:
+                left, right, top, bottom = (focal * np.tan(edge) for edge in edges)
+                K = np.array([[focal, 0, left], [0, focal, top], [0, 0, 1]])
+                size = (max(1, round(left + right)), max(1, round(top + bottom)))
+                return [("", np.eye(3), K, size)]
         side = max(2, round(2 * focal))
         K = np.array([[side / 2, 0, side / 2], [0, side / 2, side / 2], [0, 0, 1]])
         steps = (np.arange(32) + 0.5) / 16 - 1
-        grid = np.stack([*(a.ravel() for a in np.meshgrid(steps, steps)), np.ones(32 * 32)], 1)
-        held = {name: self.turned(turn).project(grid)[1].mean() for name, turn in FACES.items()}
-        return [(name, FACES[name], K, (side, side)) for name in FACES if held[name] >= _LEAST_SEEN]
+        x, y = np.meshgrid(steps, steps)
+        grid = np.stack([x.ravel(), y.ravel(), np.ones(x.size)], 1)
+        found: list[Face] = []
+        for name, turn in FACES.items():
+            _, held = self.turned(turn).project(grid)
+            if held.mean() >= _LEAST_SEEN:
+                found.append((name, turn, K, (side, side)))
+        return found
+
+
+def _bend_by_fov(u: Float, v: Float, r2: Float, omega: float) -> tuple[Float, Float]:
+    """Distort points by the model of a wide lens with one parameter."""
+    if abs(omega) < 1e-6:
+        return u, v
+    r = np.sqrt(r2)
+    slope = np.tan(omega / 2)
+    wide = np.arctan(2 * r * slope) / omega
+    factor = np.where(r > 1e-9, wide / np.maximum(r, 1e-9), 2 * slope / omega)
+    return u * factor, v * factor
 
 
 @lru_cache(maxsize=64)
@@ -178,9 +200,7 @@ def _find_end(lens: PhotoLens) -> float:
     end = float(angles[most - 1])
     if planar:
         return end
-    cx, cy, _ = lens._centre_and_rest
-    ends = np.array([cx, lens.size[0] - cx, cy, lens.size[1] - cy]) / np.repeat(lens.focal, 2)
-    edge = float(np.interp(ends.max(), radii[:most], angles[:most]))
+    edge = float(lens._measure_edges(radii[:most], angles[:most]).max())
     return min(end, max(edge, _CORNER))
 
 
@@ -189,8 +209,9 @@ def panorama_rays(width: int, height: int, rows: slice) -> Float:
     v, u = np.mgrid[rows, 0:width] + 0.5
     around = 2 * np.pi * (u / width - 0.5)
     down = np.pi * (v / height - 0.5)
-    aside = np.cos(down)
-    return np.stack([np.sin(around) * aside, np.sin(down), np.cos(around) * aside], axis=-1).reshape(-1, 3)
+    level = np.cos(down)
+    rays = np.stack([np.sin(around) * level, np.sin(down), np.cos(around) * level], axis=-1)
+    return rays.reshape(-1, 3)
 
 
 def photo_of(name: str) -> str:

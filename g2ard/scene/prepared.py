@@ -66,12 +66,13 @@ def _list_values(splats: Splats) -> dict[str, Any]:
 
 def finite_rows_of(splats: Splats) -> tuple[PreparedScene, Mask | slice]:
     """Return the finite rows of a scene, prepared, and their mask."""
-    arrays = (splats.means, splats.quats, splats.scales, splats.sh0, splats.shN)
-    everything = all(_are_finite(a) for a in arrays) and not np.isnan(splats.logit_opacities).any()
-    finite = np.ones(len(splats), bool) if everything else splats.finite_rows()
-    if not finite.any():
-        raise InputError(f"none of the {len(splats)} rows is finite", parameter="splats")
-    scene = splats if everything else splats.take(finite)
+    scene = splats
+    rows: Mask | slice = slice(None)
+    if not _is_finite(splats):
+        rows = splats.finite_rows()
+        if not rows.any():
+            raise InputError(f"none of the {len(splats)} rows is finite", parameter="splats")
+        scene = splats.take(rows)
     kind = np.float64 if scene.means.dtype == np.float64 else np.float32
     scales = np.ascontiguousarray(scene.scales, np.float32)
     if scales.max() > LARGEST_SCALE:
@@ -86,7 +87,14 @@ def finite_rows_of(splats: Splats) -> tuple[PreparedScene, Mask | slice]:
         shN=np.ascontiguousarray(scene.shN, np.float32),
     )
     scene = scene.with_sh_degree(_find_used_degree(scene))
-    return as_prepared(scene), slice(None) if everything else finite
+    return as_prepared(scene), rows
+
+
+def _is_finite(splats: Splats) -> bool:
+    """Return whether a scene has rows and all are finite; infinite logits count as finite."""
+    if not len(splats) or np.isnan(splats.logit_opacities).any():
+        return False
+    return all(map(_are_finite, (splats.means, splats.quats, splats.scales, splats.sh0, splats.shN)))
 
 
 def with_some_opacity(scene: PreparedScene) -> PreparedScene:
@@ -95,9 +103,8 @@ def with_some_opacity(scene: PreparedScene) -> PreparedScene:
     Otherwise all rows would be dropped, or all have mass 0.
     """
     logits = scene.logit_opacities
-    return replace(
-        scene, logit_opacities=np.where(np.isinf(logits), logits, np.maximum(logits, _LEAST_LOGIT))
-    )
+    raised = np.where(np.isinf(logits), logits, np.maximum(logits, _LEAST_LOGIT))
+    return replace(scene, logit_opacities=raised)
 
 
 def _are_finite(values: Values) -> bool:

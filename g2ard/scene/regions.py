@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from g2ard.arrays import Mask
+from g2ard.arrays import Float, Mask
 from g2ard.errors import InputError
 from g2ard.scene.samples import weighted_quantile
 from g2ard.scene.shape import longer_axes
@@ -90,19 +90,7 @@ def sky_mask(splats: Splats) -> Mask:
     (100, 0)
     """
     opacities = splats.opacities.astype(np.float64)
-    rows = np.flatnonzero(splats.finite_rows() & (opacities > 1 / 255))
-    rows = rows[:: max(1, -(-len(rows) // _RADIUS_SAMPLE))]
-    middle = np.zeros(3)
-    reach = np.inf
-    for _ in range(4):  # without the sky, which moves the middle and widens the radius
-        if not len(rows):
-            break
-        means = splats.means[rows].astype(np.float64)
-        weights = opacities[rows]
-        middle = np.array([weighted_quantile(means[:, axis], weights, 0.5) for axis in range(3)])
-        away = np.linalg.norm(means - middle, axis=1)
-        reach = _SKY_RADII * weighted_quantile(away, weights, _NEAR_SHARE)
-        rows = rows[away <= reach]
+    middle, reach = _find_near_scene(splats, opacities)
     away = np.linalg.norm(splats.means.astype(np.float64) - middle, axis=1)
     sky = away > reach
     middle_size, largest = longer_axes(splats.scales[sky].astype(np.float64)).T
@@ -110,3 +98,24 @@ def sky_mask(splats: Splats) -> Mask:
     if covered.sum() <= _LEAST_SKY_SHARE:
         sky[:] = False
     return sky
+
+
+def _find_near_scene(splats: Splats, opacities: Float) -> tuple[Float, float]:
+    """Return the (3,) middle of the near scene, and the distance from it at which a sky may begin.
+
+    Rows beyond are dropped and both are found again, because a sky moves the middle and widens the radius.
+    """
+    rows = np.flatnonzero(splats.finite_rows() & (opacities > 1 / 255))
+    rows = rows[:: max(1, -(-len(rows) // _RADIUS_SAMPLE))]
+    middle = np.zeros(3)
+    reach = np.inf
+    for _ in range(4):
+        if not len(rows):
+            break
+        means = splats.means[rows].astype(np.float64)
+        weights = opacities[rows]
+        middle = np.array([weighted_quantile(column, weights, 0.5) for column in means.T])
+        away = np.linalg.norm(means - middle, axis=1)
+        reach = _SKY_RADII * weighted_quantile(away, weights, _NEAR_SHARE)
+        rows = rows[away <= reach]
+    return middle, reach

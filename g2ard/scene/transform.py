@@ -22,9 +22,14 @@ _RECENTRE_EXTENTS = 16.0
 """Distance in extents beyond which a move goes into `offset`, so that float32 means keep their precision."""
 
 _DIRECTIONS = {
-    **{"R": (1, 0, 0), "U": (0, 1, 0), "B": (0, 0, 1)},
-    **{"L": (-1, 0, 0), "D": (0, -1, 0), "F": (0, 0, -1)},
+    "R": (1, 0, 0),
+    "L": (-1, 0, 0),
+    "U": (0, 1, 0),
+    "D": (0, -1, 0),
+    "B": (0, 0, 1),
+    "F": (0, 0, -1),
 }
+"""Letter → its direction in the system RUB."""
 _ODD = ("y", "z", "x", "xy", "yz", "", "xz", "", "y", "xyz", "y", "z", "x", "z", "x")
 """Axes in which each harmonic of bands 1–3 is odd."""
 
@@ -49,25 +54,39 @@ def transform(splats: Splats, matrix: ArrayLike) -> Splats:
     means = scale * splats.means.astype(np.float64) @ rotation.T
     offset = scale * splats.offset @ rotation.T
     extent = float(np.linalg.norm(np.ptp(means, axis=0))) if len(means) else 0.0
-    far = (
-        0 < _RECENTRE_EXTENTS * extent < np.abs(shift).max()
-    )  # an extent of 0 says nothing about the scene's size
+    # An extent of 0 says nothing about the scene's size.
+    far = 0 < _RECENTRE_EXTENTS * extent < np.abs(shift).max()
     if splats.offset.any() or far:
         offset = offset + shift
     else:
         means = means + shift
         offset = np.zeros(3)
     w, x, y, z = quaternion_of(rotation)
-    turn = np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
+    product = np.array(  # of this quaternion with another, on its right
+        [
+            [w, -x, -y, -z],
+            [x, w, -z, y],
+            [y, z, w, -x],
+            [z, -y, x, w],
+        ]
+    )
+    quats = splats.quats.astype(np.float64) @ product.T
     return replace(
         splats,
         means=means.astype(splats.means.dtype),
-        quats=(splats.quats.astype(np.float64) @ turn.T).astype(np.float32),
+        quats=quats.astype(np.float32),
         scales=(splats.scales * scale).astype(np.float32),
         shN=rotate_harmonics(splats.shN, rotation),
         offset=offset,
-        up=None if splats.up is None else tuple((rotation @ splats.up).tolist()),
+        up=_turn_up(splats, rotation),
     )
+
+
+def _turn_up(splats: Splats, matrix: Float) -> Any:
+    """Return a scene's up direction after a turn, if it states one."""
+    if splats.up is None:
+        return None
+    return tuple((matrix @ splats.up).tolist())
 
 
 def moving(scale: float, degrees: Sequence[float], shift: Sequence[float]) -> Float:
@@ -78,14 +97,18 @@ def moving(scale: float, degrees: Sequence[float], shift: Sequence[float]) -> Fl
     """
     rotation = np.eye(3)
     for axis, angle in enumerate(np.radians(degrees)):
+        a = (axis + 1) % 3  # turns towards b
+        b = (axis + 2) % 3
         turn = np.eye(3)
-        (a, b) = ((1, 2), (2, 0), (0, 1))[axis]
-        turn[a, a] = turn[b, b] = np.cos(angle)
-        turn[b, a], turn[a, b] = np.sin(angle), -np.sin(angle)
+        turn[a, a] = np.cos(angle)
+        turn[b, b] = np.cos(angle)
+        turn[b, a] = np.sin(angle)
+        turn[a, b] = -np.sin(angle)
         rotation = turn @ rotation
-    out = np.eye(4)
-    out[:3, :3], out[:3, 3] = scale * rotation, shift
-    return out
+    matrix = np.eye(4)
+    matrix[:3, :3] = scale * rotation
+    matrix[:3, 3] = shift
+    return matrix
 
 
 def placed(splats: Splats, matrix: Float) -> Splats:
@@ -109,6 +132,7 @@ def deformed(splats: Splats, matrix: Float) -> tuple[Splats, bool]:
     exact = bool(np.allclose(turn @ turn.T, np.eye(3), atol=1e-4))
     if exact and det > 0:
         return placed(splats, matrix), True
+    # Σ = A·Aᵀ with the scaled axes A, so M·A = U·S·Vᵀ gives the new axes U and scales S.
     axes = rotation_matrices(splats.quats) * splats.scales.astype(np.float64)[:, None, :]
     frames, scales, _ = np.linalg.svd(linear @ axes)
     frames *= np.sign(np.linalg.det(frames))[:, None, None]
@@ -119,45 +143,76 @@ def deformed(splats: Splats, matrix: Float) -> tuple[Splats, bool]:
         shN = rotate_harmonics(splats.shN, np.sign(det) * turn)
     else:
         shN = _warp(splats.shN, linear)
-    return replace(
+    means = splats.means.astype(np.float64) @ linear.T
+    scene = replace(
         moved,
-        means=(splats.means.astype(np.float64) @ linear.T).astype(splats.means.dtype),
+        means=means.astype(splats.means.dtype),
         quats=_to_quaternions(frames),
         scales=scales.astype(np.float32),
         shN=shN,
-    ), exact
+    )
+    return scene, exact
 
 
 def _warp(shN: Float32, linear: Float) -> Float32:
     """Fit coefficients of bands 1 to 3 to c'(d) = c(M⁻¹·d) over many directions."""
-    directions = np.random.default_rng(0).normal(size=(512, 3))
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    directions = _draw_directions(512)
     before = directions @ np.linalg.inv(linear).T
     before /= np.linalg.norm(before, axis=1, keepdims=True)
     rest = shN.shape[1]
     here = _evaluate_basis(directions)[:, :rest]
     there = _evaluate_basis(before)[:, :rest]
-    turn = np.linalg.lstsq(here, there, rcond=None)[0]
-    return np.einsum("kj,njc->nkc", turn, shN.astype(np.float64)).astype(np.float32)
+    return _recombine(shN, here, there).astype(np.float32)
+
+
+def _draw_directions(count: int) -> Float:
+    directions = np.random.default_rng(0).normal(size=(count, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    return directions
+
+
+def _recombine(coefficients: Float32, here: Float, there: Float) -> Float:
+    """Return coefficients with which the basis `here` gives the colours that it gave with these `there`.
+
+    Args:
+        coefficients: (N, K, 3).
+        here: (D, K) basis in some directions.
+        there: (D, K) basis in the directions that these were before.
+    """
+    turn, *_ = np.linalg.lstsq(here, there, rcond=None)
+    return np.einsum("kj,njc->nkc", turn, coefficients.astype(np.float64))
 
 
 def _to_quaternions(rotations: Float) -> Float32:
-    """Return (N, 4) wxyz of (N, 3, 3) rotations, by the largest of the four components."""
+    """Return (N, 4) wxyz of (N, 3, 3) rotations, by the largest of the four components.
+
+    A rotation gives all products 4·q_a·q_b. Their row of the largest component is that quaternion but for
+    its length.
+    """
     r = rotations
     trace = r[:, 0, 0] + r[:, 1, 1] + r[:, 2, 2]
-    squares = np.stack([trace, *(2 * r[:, i, i] - trace for i in range(3))], axis=1) + 1
-    rows = np.arange(len(r))
-    largest = squares.argmax(axis=1)
     products = np.empty((len(r), 4, 4))
-    for i in range(4):
-        products[:, i, i] = squares[:, i]
-    for a, b, i, j, sign in (
-        *((0, 1, 2, 1, -1), (0, 2, 0, 2, -1), (0, 3, 1, 0, -1)),
-        *((1, 2, 0, 1, 1), (1, 3, 0, 2, 1), (2, 3, 1, 2, 1)),
-    ):
-        products[:, a, b] = products[:, b, a] = r[:, i, j] + sign * r[:, j, i]
-    quats = products[rows, largest]
+    products[:, 0, 0] = trace + 1
+    for i in range(3):
+        products[:, i + 1, i + 1] = 2 * r[:, i, i] - trace + 1
+    for a, b, i, j, sign in _PRODUCTS:
+        products[:, a, b] = r[:, i, j] + sign * r[:, j, i]
+        products[:, b, a] = products[:, a, b]
+    squares = np.einsum("nii->ni", products)
+    largest = squares.argmax(axis=1)
+    quats = products[np.arange(len(r)), largest]
     return (quats / np.linalg.norm(quats, axis=1, keepdims=True)).astype(np.float32)
+
+
+_PRODUCTS = (
+    (0, 1, 2, 1, -1),
+    (0, 2, 0, 2, -1),
+    (0, 3, 1, 0, -1),
+    (1, 2, 0, 1, 1),
+    (1, 3, 0, 2, 1),
+    (2, 3, 1, 2, 1),
+)
+"""(a, b, i, j, sign): the product of components a and b is R[i, j] + sign·R[j, i]."""
 
 
 def similarity(matrix: ArrayLike) -> tuple[float, Float, Float]:
@@ -191,31 +246,38 @@ def unit_up(up: ArrayLike) -> Float:
 
 def quaternion_of(rotation: Float) -> Float:
     """Return (4,) wxyz: the eigenvector of the largest eigenvalue of Bar-Itzhack's matrix."""
-    r = rotation
-    k = np.array(
+    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = rotation
+    upper = np.array(
         [
-            [np.trace(r), r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]],
-            [0, r[0, 0] - r[1, 1] - r[2, 2], r[0, 1] + r[1, 0], r[0, 2] + r[2, 0]],
-            [0, 0, r[1, 1] - r[0, 0] - r[2, 2], r[1, 2] + r[2, 1]],
-            [0, 0, 0, r[2, 2] - r[0, 0] - r[1, 1]],
+            [np.trace(rotation), zy - yz, xz - zx, yx - xy],
+            [0, xx - yy - zz, xy + yx, xz + zx],
+            [0, 0, yy - xx - zz, yz + zy],
+            [0, 0, 0, zz - xx - yy],
         ]
     )
-    q: Float = np.linalg.eigh(np.triu(k) + np.triu(k, 1).T)[1][:, -1]
+    _, vectors = np.linalg.eigh(np.triu(upper) + np.triu(upper, 1).T)  # ascending
+    q: Float = vectors[:, -1]
     return q if q[0] >= 0 else -q
 
 
 def rotation_matrices(quats: NDArray[np.floating]) -> Float:
     """Return (N, 3, 3) matrices of (N, 4) wxyz quaternions of any length; zero is the identity."""
     q = quats.astype(np.float64)
-    largest = np.abs(q).max(1, keepdims=True)
-    q = np.where(largest > 0, q / np.where(largest > 0, largest, 1), [1.0, 0.0, 0.0, 0.0])
+    largest = np.abs(q).max(1, keepdims=True)  # divided by first, so that no square overflows
+    scaled = q / np.where(largest > 0, largest, 1)
+    q = np.where(largest > 0, scaled, [1.0, 0.0, 0.0, 0.0])
     w, x, y, z = (q / np.linalg.norm(q, axis=1, keepdims=True)).T
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.stack([np.stack(row, -1) for row in rows], -2)
+    matrices = np.empty((len(quats), 3, 3))
+    matrices[:, 0, 0] = 1 - 2 * (y * y + z * z)
+    matrices[:, 0, 1] = 2 * (x * y - w * z)
+    matrices[:, 0, 2] = 2 * (x * z + w * y)
+    matrices[:, 1, 0] = 2 * (x * y + w * z)
+    matrices[:, 1, 1] = 1 - 2 * (x * x + z * z)
+    matrices[:, 1, 2] = 2 * (y * z - w * x)
+    matrices[:, 2, 0] = 2 * (x * z - w * y)
+    matrices[:, 2, 1] = 2 * (y * z + w * x)
+    matrices[:, 2, 2] = 1 - 2 * (x * x + y * y)
+    return matrices
 
 
 def rotate_harmonics(shN: Float32, rotation: Float) -> Float32:
@@ -224,18 +286,16 @@ def rotate_harmonics(shN: Float32, rotation: Float) -> Float32:
     Bands rotate separately: the matrix M of a band solves Y(d)·M = Y(R⁻¹·d) by least squares over many
     directions.
     """
-    out = np.empty_like(shN)
-    directions = np.random.default_rng(0).normal(size=(64, 3))
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    turned = np.empty_like(shN)
+    directions = _draw_directions(64)
     here = _evaluate_basis(directions)
     there = _evaluate_basis(directions @ rotation)
     for band in range(1, 4):
         rows = slice(band * band - 1, (band + 1) ** 2 - 1)
         if rows.stop > shN.shape[1]:
             break
-        turn = np.linalg.lstsq(here[:, rows], there[:, rows], rcond=None)[0]
-        out[:, rows] = np.einsum("kj,njc->nkc", turn, shN[:, rows].astype(np.float64))
-    return out
+        turned[:, rows] = _recombine(shN[:, rows], here[:, rows], there[:, rows])
+    return turned
 
 
 def harmonic_signs(axes: Iterable[float]) -> Float32:
@@ -262,11 +322,21 @@ def _evaluate_basis(d: Float) -> Float:
     g = 0.4570457994644658
     h = 0.3731763325901154
     columns: list[Any] = [
-        *(-0.4886025119029199 * y, 0.4886025119029199 * z, -0.4886025119029199 * x),
-        *(a * x * y, -a * y * z, b * (2 * zz - xx - yy), -a * x * z, c * (xx - yy)),
-        *(-e * y * (3 * xx - yy), f * x * y * z, -g * y * (4 * zz - xx - yy)),
+        -0.4886025119029199 * y,
+        0.4886025119029199 * z,
+        -0.4886025119029199 * x,
+        a * x * y,
+        -a * y * z,
+        b * (2 * zz - xx - yy),
+        -a * x * z,
+        c * (xx - yy),
+        -e * y * (3 * xx - yy),
+        f * x * y * z,
+        -g * y * (4 * zz - xx - yy),
         h * z * (2 * zz - 3 * xx - 3 * yy),
-        *(-g * x * (4 * zz - xx - yy), 0.5 * f * z * (xx - yy), -e * x * (xx - 3 * yy)),
+        -g * x * (4 * zz - xx - yy),
+        0.5 * f * z * (xx - yy),
+        -e * x * (xx - 3 * yy),
     ]
     return np.stack(columns, axis=1)
 
@@ -279,11 +349,14 @@ def change_of_axes(source: str, target: str) -> Float:
     >>> change_of_axes("y-up", "z-up") @ [1, 2, 3]
     array([ 1., -3.,  2.])
     """
-    source, target = (NAMED_AXES.get(name, name) for name in (source, target))
-    for name in (source, target):
-        require("axes", repr(name), name in AXES, f"one of {', '.join((*NAMED_AXES, *AXES))}")
-    there, here = (np.array([_DIRECTIONS[letter] for letter in name], float) for name in (target, source))
-    return there @ here.T
+    return _directions_of(target) @ _directions_of(source).T
+
+
+def _directions_of(name: str) -> Float:
+    """Return the (3, 3) rows of directions of a system's axes."""
+    letters = NAMED_AXES.get(name, name)
+    require("axes", repr(name), letters in AXES, f"one of {', '.join((*NAMED_AXES, *AXES))}")
+    return np.array([_DIRECTIONS[letter] for letter in letters], float)
 
 
 def with_axes(splats: Splats, matrix: Float) -> Splats:
@@ -293,12 +366,12 @@ def with_axes(splats: Splats, matrix: Float) -> Splats:
     their w and permute the rest like a vector, with all digits, and no rotation is rounded.
     """
     sign = np.sign(np.linalg.det(matrix))
-    axis = matrix.astype(np.float32)
-    places = np.abs(matrix).argmax(axis=1)
-    quats = np.concatenate([splats.quats[:, :1], splats.quats[:, 1:] @ (np.float32(sign) * axis).T], axis=1)
+    turn = np.float32(sign) * matrix.astype(np.float32)
+    quats = np.concatenate([splats.quats[:, :1], splats.quats[:, 1:] @ turn.T], axis=1)
     shN = rotate_harmonics(splats.shN, sign * matrix)
     if sign < 0:
         shN *= harmonic_signs((-1, -1, -1))[: shN.shape[1], None]
+    places = np.abs(matrix).argmax(axis=1)
     return replace(
         splats,
         means=splats.means @ matrix.astype(splats.means.dtype).T,
@@ -306,7 +379,7 @@ def with_axes(splats: Splats, matrix: Float) -> Splats:
         scales=np.ascontiguousarray(splats.scales[:, places]),
         shN=shN,
         offset=matrix @ splats.offset,
-        up=None if splats.up is None else tuple((matrix @ splats.up).tolist()),
+        up=_turn_up(splats, matrix),
     )
 
 
@@ -410,7 +483,8 @@ def in_box(splats: Splats, low: ArrayLike, high: ArrayLike) -> Mask:
 
 def within_box(world: Float, low: ArrayLike, high: ArrayLike) -> Mask:
     """Return the (N,) mask of (N, 3) positions in an axis-aligned box (inclusive)."""
-    low, high = (np.asarray(v, np.float64) for v in (low, high))
+    low = np.asarray(low, np.float64)
+    high = np.asarray(high, np.float64)
     if not (low <= high).all():
         raise InputError(
             f"from {low.tolist()} to {high.tolist()} holds nothing; the lower corner comes first",
