@@ -167,19 +167,20 @@ def median_colors(
             pixels, visible = (found[own[few]] for found in _find_seen(positions, positions, cameras, view))
         else:
             pixels, visible = _find_seen(positions[own[few]], hiding, cameras, view)
-        pixels = pixels[visible]
+        u, v = pixels[visible].T
         rows = few[visible]
         if not len(rows):
             continue
         image, mask = load_photo(cameras, view, None)
-        sample = image[pixels[:, 1], pixels[:, 0]]
+        sample = image[v, u]
         if mask is not None:
-            held = mask[pixels[:, 1], pixels[:, 0]]
+            held = mask[v, u]
             rows = rows[held]
             sample = sample[held]
         if image.shape[2] == 4:
-            rows = rows[sample[:, 3] > 0.5]
-            sample = sample[sample[:, 3] > 0.5]
+            opaque = sample[:, 3] > 0.5
+            rows = rows[opaque]
+            sample = sample[opaque]
             sample = sample[:, :3] / sample[:, 3:]
         kept[rows, count[rows]] = np.rint(255 * np.clip(sample, 0, 1))
         count[rows] += 1
@@ -192,19 +193,24 @@ def median_colors(
 
 def _find_seen(positions: Float, hiding: Float, cameras: Cameras, view: int) -> tuple[Rows, Mask]:
     """Return (N, 2) columns and rows of points in a view, and whether they are inside and not hidden."""
-    pixels, depth, inside = own = _project(positions, cameras, view)
+    own = _project(positions, cameras, view)
     others, depths, drawn = own if hiding is positions else _project(hiding, cameras, view)
+    pixels, depth, inside = own
     width = int(cameras.widths[view])
     height = int(cameras.heights[view])
-    side = max(1.0, np.sqrt(width * height * _CELL_POINTS / max(1, int(drawn.sum()))))
+    cell_pixels = width * height * _CELL_POINTS / max(1, int(drawn.sum()))
+    side = max(1.0, np.sqrt(cell_pixels))
     across = int(width / side) + 1
+    down = int(height / side) + 1
 
     def cells(at: Rows) -> Rows:
-        return (at[:, 1] / side).astype(np.intp) * across + (at[:, 0] / side).astype(np.intp)
+        column, row = (at / side).astype(np.intp).T
+        return row * across + column
 
-    nearest = np.full(across * (int(height / side) + 1), np.inf)
+    nearest = np.full(across * down, np.inf)
     np.minimum.at(nearest, cells(others[drawn]), depths[drawn])
-    return pixels, inside & (depth <= (1 + _DEPTH_SLACK) * nearest[cells(pixels)])
+    hidden_from = (1 + _DEPTH_SLACK) * nearest[cells(pixels)]
+    return pixels, inside & (depth <= hidden_from)
 
 
 def _project(positions: Float, cameras: Cameras, view: int) -> tuple[Rows, Float, Mask]:

@@ -44,9 +44,12 @@ class VisualHull:
 
     def depths(self, cameras: Cameras, view: int, count: int) -> Float:
         """Return (count,) depths that cover the grid's box in a view, evenly spaced."""
-        corners = self.low + np.indices((2, 2, 2)).reshape(3, 8).T * self.side * self.filled.shape
-        depth = corners @ cameras.viewmats[view, 2, :3] + cameras.viewmats[view, 2, 3]
-        return np.linspace(max(depth.min(), 1e-3 * depth.max()), depth.max(), count)
+        unit_corners = np.indices((2, 2, 2)).reshape(3, 8).T
+        corners = self.low + unit_corners * self.side * self.filled.shape
+        row = cameras.viewmats[view, 2]
+        depth = corners @ row[:3] + row[3]
+        farthest = depth.max()
+        return np.linspace(max(depth.min(), 1e-3 * farthest), farthest, count)
 
 
 def visual_hull(cameras: Cameras, outlines: Sequence[Mask | None], middle: Float) -> VisualHull | None:
@@ -94,22 +97,26 @@ def _outline_view(
 def _carve(views: Sequence[tuple[Float, Mask]], low: Float, side: Float, count: int) -> Mask:
     """Return the (count, count, count) voxels that are in sight and within the outlines."""
     steps = np.arange(count) + 0.5
+    most_empty = _EMPTY_VIEWS_SHARE * len(views)
     filled = np.zeros((count, count * count), bool)
-    plane = np.stack(np.meshgrid(steps, steps, indexing="ij"), -1).reshape(-1, 2) * side[1:] + low[1:]
+    y_and_z = np.stack(np.meshgrid(steps, steps, indexing="ij"), -1).reshape(-1, 2)
+    plane = y_and_z * side[1:] + low[1:]  # centres of a slab's voxels
     for slab, x in enumerate(low[0] + steps * side[0]):
         points = plane
-        left = np.arange(len(plane))
+        left = np.arange(len(plane))  # voxels that are not carved away
         empty = np.zeros(len(plane), np.int16)
         seen = np.zeros(len(plane), np.int16)
         for P, shown in views:
+            height, width = shown.shape
             ahead = points @ P[:, 1:3].T + (P[:, 0] * x + P[:, 3])
             depth = np.maximum(ahead[:, 2], 1e-9)
             u, v = (ahead[:, :2] / depth[:, None]).T
-            inside = (ahead[:, 2] > 0) & (u >= 0) & (v >= 0) & (u < shown.shape[1]) & (v < shown.shape[0])
-            hit = shown[np.where(inside, v, 0).astype(np.intp), np.where(inside, u, 0).astype(np.intp)]
+            inside = (ahead[:, 2] > 0) & (u >= 0) & (v >= 0) & (u < width) & (v < height)
+            rows = np.where(inside, v, 0).astype(np.intp)
+            columns = np.where(inside, u, 0).astype(np.intp)
             seen += inside
-            empty += inside & ~hit
-            kept = empty <= _EMPTY_VIEWS_SHARE * len(views)
+            empty += inside & ~shown[rows, columns]
+            kept = empty <= most_empty
             if not kept.all():
                 points = points[kept]
                 left = left[kept]
@@ -125,10 +132,11 @@ def grown(mask: Mask, radius: int) -> Mask:
     >>> grown(np.eye(4, dtype=bool)[:2], 1).astype(int).tolist()
     [[1, 1, 1, 0], [1, 1, 1, 0]]
     """
+    span = 2 * radius + 1
     for axis in (0, 1):
-        pad = [(radius + 1, radius) if k == axis else (0, 0) for k in range(2)]
+        pad = [(0, 0), (0, 0)]
+        pad[axis] = (radius + 1, radius)
         sums = np.cumsum(np.pad(mask, pad).astype(np.int32), axis=axis)
-        span = 2 * radius + 1
         first = np.arange(mask.shape[axis])
-        mask = sums.take(first + span, axis) > sums.take(first, axis)
+        mask = sums.take(first + span, axis) > sums.take(first, axis)  # any within the span
     return mask

@@ -90,13 +90,15 @@ def points_along_rays(
         raise InputError(
             f"view {bare[0]} has no photo", hint="pass views with photos, their {images=DIR}, or a scene"
         )
-    photos = list[_Photo]()
-    outlines = list[Mask | None]()
+    photos: list[_Photo] = []
+    outlines: list[Mask | None] = []
     for view in range(len(cameras)):
         image, mask = load_photo(cameras, view, None)
         outline = image[..., 3] > 0.5 if image.shape[2] == 4 else None
         photos.append(_Photo.of(composite(image, background), mask, outline, background))
-        outlines.append(outline if outline is None or mask is None else outline | ~mask)
+        if outline is not None and mask is not None:
+            outline = outline | ~mask  # masked pixels do not say that the object is elsewhere
+        outlines.append(outline)
         progress("photos", view + 1, len(cameras))
     rng = np.random.default_rng([seed, 11])
     centre = _find_common_centre(cameras)
@@ -113,8 +115,10 @@ def points_along_rays(
             )
         view = int(rng.integers(len(cameras)))
         some = min(_RAYS, max(64, -(-count // len(cameras))))
-        rows, columns = (rng.integers(side, size=some) for side in photos[view].starts.shape)
-        pixels = np.stack([rows, columns])[:, photos[view].starts[rows, columns]]
+        starts = photos[view].starts
+        rows = rng.integers(starts.shape[0], size=some)
+        columns = rng.integers(starts.shape[1], size=some)
+        pixels = np.stack([rows, columns])[:, starts[rows, columns]]
         if hull is None:
             depths = distances[view] / np.linspace(1 / _NEAREST_DEPTH, 1 / _FARTHEST_DEPTH, _TRIAL_DEPTHS)
         else:
@@ -123,7 +127,8 @@ def points_along_rays(
         rays = _Rays.of(cameras, photos, view, near[view], pixels)
         xyz, rgb = _sweep(rays, depths, hull, slack)
         tried += some
-        found = distinct(Points(np.concatenate([found.positions, xyz]), np.concatenate([found.colors, rgb])))
+        positions = np.concatenate([found.positions, xyz])
+        found = distinct(Points(positions, np.concatenate([found.colors, rgb])))
         progress("points", min(len(found), count), count)
     return Points(found.positions[:count], np.ascontiguousarray(found.colors[:count]))
 
@@ -131,20 +136,24 @@ def points_along_rays(
 def _find_common_centre(cameras: Cameras) -> Float:
     """Return the (3,) point nearest to all optical axes, or a point ahead of the mean camera if they hardly
     cross."""
-    across = np.eye(3) - cameras.forwards[:, :, None] * cameras.forwards[:, None, :]
-    pull = across.sum(0)
+    positions = cameras.positions
+    forwards = cameras.forwards
     away = cameras.extent or 1.0
-    ahead = cameras.positions.mean(0) + away * cameras.forwards.mean(0)
+    ahead = positions.mean(0) + away * forwards.mean(0)
+    # Least squares over the distances to the axes: Σ (I − f·fᵀ)·(x − p) = 0.
+    across = np.eye(3) - forwards[:, :, None] * forwards[:, None, :]
+    pull = across.sum(0)
     if np.linalg.cond(pull) > 1e4:
         return ahead
-    middle = np.linalg.solve(pull, np.einsum("cij,cj->i", across, cameras.positions))
-    before = np.einsum("ci,ci->c", middle - cameras.positions, cameras.forwards) > 0
-    return middle if before.mean() > 0.5 else ahead
+    middle = np.linalg.solve(pull, np.einsum("cij,cj->i", across, positions))
+    is_ahead = np.einsum("ci,ci->c", middle - positions, forwards) > 0
+    return middle if is_ahead.mean() > 0.5 else ahead
 
 
 def _find_neighbours(cameras: Cameras, view: int) -> Int:
     """Return the views nearest to one in position and direction."""
-    away = np.linalg.norm(cameras.positions - cameras.positions[view], axis=1) / (cameras.extent or 1.0)
+    positions = cameras.positions
+    away = np.linalg.norm(positions - positions[view], axis=1) / (cameras.extent or 1.0)
     turn = 1 - cameras.forwards @ cameras.forwards[view]
     order = np.argsort(away + turn, kind="stable")
     return order[order != view][:_COMPARED_VIEWS]
@@ -186,18 +195,17 @@ def _sweep(ray: _Rays, depths: Float, hull: VisualHull | None, slack: float) -> 
     rows = np.arange(len(cost))
     if hull is not None:
         cost[~hull.holds(ray.at(trial))] = np.inf
-        best = (cost <= cost.min(1, keepdims=True) + _EQUAL_COST_SLACK).argmax(
-            1
-        )  # the nearest is on the hull
-        depth = trial[rows, best]
-        least = cost[rows, best]
-        kept = np.isfinite(least)
+        is_best = cost <= cost.min(1, keepdims=True) + _EQUAL_COST_SLACK
+        nearest = is_best.argmax(1)  # the nearest is on the hull
+        depth = trial[rows, nearest]
+        kept = np.isfinite(cost[rows, nearest])
     else:
         finite = np.isfinite(cost)
         middle = np.maximum(finite.sum(1) // 2, 1) - 1
         usual = np.sort(cost, axis=1)[rows, middle]  # the median, since infinities are sorted last
         depth, least = _refine(ray, trial, cost)
-        kept = finite.any(1) & (least <= slack * np.minimum(_MOST_POINT_COST, _MOST_POINT_COST_SHARE * usual))
+        limit = np.minimum(_MOST_POINT_COST, _MOST_POINT_COST_SHARE * usual)
+        kept = finite.any(1) & (least <= slack * limit)
     return ray.at(depth[:, None])[kept, 0], ray.colors[kept]
 
 
@@ -209,18 +217,18 @@ def _refine(ray: _Rays, trial: Float, cost: Float) -> tuple[Float, Float]:
     """
     padded = np.pad(cost, ((0, 0), (1, 1)), constant_values=np.inf)
     is_minimum = (cost <= padded[:, :-2]) & (cost <= padded[:, 2:])
-    order = np.argsort(np.where(is_minimum, cost, np.inf), axis=1, kind="stable")[:, :_REFINED_DEPTHS]
-    rows = np.arange(len(cost))[:, None]
-    inverse_depth = 1 / trial[rows, order]
+    minima = np.where(is_minimum, cost, np.inf)
+    order = np.argsort(minima, axis=1, kind="stable")[:, :_REFINED_DEPTHS]
+    rows = np.arange(len(cost))
+    inverse_depth = 1 / trial[rows[:, None], order]
     spacing = np.abs(1 / trial[:, :1] - 1 / trial[:, 1:2])
     offsets = np.linspace(-0.75, 0.75, _FINER_DEPTHS)
     tried = inverse_depth[:, :, None] + offsets * spacing[:, :, None]
-    finer = (1 / np.maximum(tried, 1e-3 * inverse_depth[:, :, None])).reshape(
-        len(cost), order.shape[1] * len(offsets)
-    )
+    least = 1e-3 * inverse_depth[:, :, None]
+    finer = (1 / np.maximum(tried, least)).reshape(len(cost), order.shape[1] * len(offsets))
     costs = ray.costs(finer)
     best = costs.argmin(1)
-    return finer[rows[:, 0], best], costs[rows[:, 0], best]
+    return finer[rows, best], costs[rows, best]
 
 
 @dataclass(frozen=True, eq=False)
@@ -287,7 +295,7 @@ class _Rays:
     def _sampled(self, view: int, world: Float) -> tuple[Float, Mask]:
         """Return the colours of world points in a photo, and whether it shows them; black if not."""
         photo = self.photos[view].image
-        valid = self.photos[view].valid
+        height, width, _ = photo.shape
         pose = self.cameras.viewmats[view]
         K = self.cameras.Ks[view]
         local = world @ pose[:3, :3].T + pose[:3, 3]
@@ -295,9 +303,8 @@ class _Rays:
         depth = np.where(ahead, local[..., 2], 1.0)
         u = np.floor(K[0, 0] * local[..., 0] / depth + K[0, 2])
         v = np.floor(K[1, 1] * local[..., 1] / depth + K[1, 2])
-        held = ahead & (u >= 0) & (v >= 0) & (u < photo.shape[1]) & (v < photo.shape[0])
+        held = ahead & (u >= 0) & (v >= 0) & (u < width) & (v < height)
         rows = np.where(held, v, 0).astype(int)
         columns = np.where(held, u, 0).astype(int)
-        color = photo[rows, columns]
-        held = held & valid[rows, columns]
-        return np.where(held[..., None], color, 0.0), held
+        held = held & self.photos[view].valid[rows, columns]
+        return np.where(held[..., None], photo[rows, columns], 0.0), held

@@ -319,15 +319,18 @@ def _match_light(photo: Level, shot: Shot) -> tuple[float, float]:
 
 def _solve(normal: Normal) -> Float | None:
     """Solve the normal equations with unit diagonal scaling; return None if an unknown is undetermined."""
-    if (unit_scaled := _scale_to_unit(normal.matrix)) is None:
+    unit_scaled = _scale_to_unit(normal.matrix)
+    if unit_scaled is None:
         return None
     scaled, unit = unit_scaled
-    return unit * np.linalg.solve(scaled + _DAMPING * np.eye(len(unit)), unit * normal.right)
+    damped = scaled + _DAMPING * np.eye(len(unit))
+    return unit * np.linalg.solve(damped, unit * normal.right)
 
 
 def inverse(matrix: Float) -> Float | None:
     """Invert a symmetric matrix with unit diagonal scaling; return None if it is singular."""
-    if (unit_scaled := _scale_to_unit(matrix)) is None:
+    unit_scaled = _scale_to_unit(matrix)
+    if unit_scaled is None:
         return None
     scaled, unit = unit_scaled
     if np.linalg.eigvalsh(scaled)[0] < 1e-12:

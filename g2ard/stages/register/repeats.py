@@ -34,8 +34,10 @@ from g2ard.stages.register.solve import lifted, solve_pnp
 
 _MOST_PAIRS = 50_000
 """About the most pairs of like features that are counted."""
-_MOST_PEAKS = 96, 8
-"""Most common displacements that are tried, of points and of pixels."""
+_MOST_POINT_PEAKS = 96
+"""Most common displacements of points that are tried."""
+_MOST_PIXEL_PEAKS = 8
+"""Most common displacements of pixels that are tried."""
 _MOST_REPEATS = 6
 """Most poses that are returned."""
 _LEAST_SHIFT = 0.04
@@ -46,15 +48,21 @@ _MOST_FEATURES = 700
 """About the most features that are matched."""
 _MOST_MATCHES = 250
 """About the most matches that a pose is solved from."""
-_CELL = 0.05, 0.02
-"""Side of the cells of displacements, as a share of the longer side and of the depth; they and their
-neighbours make a repetition."""
-_LEAST_SUPPORT = 12, 0.05
-"""Least matches that support a repetition, and as a share of the features."""
+_PIXEL_CELL = 0.05
+"""Side of the cells of displacements of pixels, as a share of the longer side; they and their neighbours make
+a repetition."""
+_POINT_CELL = 0.02
+"""The same of points, as a share of the depth."""
+_LEAST_SUPPORT = 12
+"""Least matches that support a repetition."""
+_LEAST_SUPPORT_SHARE = 0.05
+"""The same as a share of the features."""
 _SELF_SIDE = 125
 """Longer side in pixels at which a render is compared with itself."""
-_SELF_LIKE = 0.5, 0.15
-"""Least ZNCC of a render with itself as moved by a repetition, and least share of its pixels compared."""
+_SELF_LIKE = 0.5
+"""Least ZNCC of a render with itself as moved by a repetition."""
+_LEAST_COMPARED = 0.15
+"""Least share of its pixels that are compared."""
 _AGREEING = 0.04
 """Largest difference in any channel at pixels where two renders agree, besides that by alignment."""
 _MISALIGNED = 0.7
@@ -96,34 +104,36 @@ def repeated_poses(renderer: Renderer, camera: Camera, sift: Sift, config: Regis
     places = places[known][::step]
     points = points[known][::step]
     descriptors = descriptors[known][::step] / np.float32(512)
-    least = max(_LEAST_SUPPORT[0], int(_LEAST_SUPPORT[1] * len(places)))
+    least = max(_LEAST_SUPPORT, int(_LEAST_SUPPORT_SHARE * len(places)))
     if len(places) < least:
         return []
     side = max(camera.width, camera.height)
-    squares = 2 - 2 * descriptors @ descriptors.T
+    squares = 2 - 2 * descriptors @ descriptors.T  # of the descriptors' distances
     apart = np.hypot(*(np.subtract.outer(axis, axis) for axis in places.T))
     i, j = np.nonzero((squares < _LIKE) & (apart > _LEAST_SHIFT * side))
-    fewer = slice(None, None, 1 + len(i) // _MOST_PAIRS)
-    i = i[fewer]
-    j = j[fewer]
-    poses = []
+    stride = 1 + len(i) // _MOST_PAIRS
+    i = i[::stride]
+    j = j[::stride]
     depth = float(np.median(points @ camera.viewmat[2, :3] + camera.viewmat[2, 3]))
     offsets = points[j] - points[i]
-    for one in _find_common(offsets / (_CELL[1] * depth), least, _MOST_PEAKS[0]):
+    shifts = places[j] - places[i]
+    poses: list[Float] = []
+    for one in _find_common(offsets / (_POINT_CELL * depth), least, _MOST_POINT_PEAKS):
         back = np.eye(4)
         back[:3, 3] = -np.median(offsets[one], 0)
         poses.append(camera.viewmat @ back)
-    for one in _find_common((places[j] - places[i]) / (_CELL[0] * side), least, _MOST_PEAKS[1]):
+    for one in _find_common(shifts / (_PIXEL_CELL * side), least, _MOST_PIXEL_PEAKS):
         few = one[:: 1 + len(one) // _MOST_MATCHES]
         answer = solve_pnp(camera, places[i[few]], points[j[few]], config)
-        if answer is not None and answer[1].sum() >= _LEAST_SUPPORT[0]:
+        if answer is not None and answer[1].sum() >= _LEAST_SUPPORT:
             poses.append(answer[0])
     resemblance = _Resemblance(out, camera, config)
     scored = sorted(((resemblance.of(pose), n) for n, pose in enumerate(poses)), reverse=True)
     found: list[Float] = []
     for likeness, n in scored:
-        known_already = (pose_error(poses[n], other) for other in found)
-        if likeness > 0 and all(a > _CELL[1] * depth or turn > 1 for a, turn in known_already):
+        errors = [pose_error(poses[n], other) for other in found]
+        is_new = all(away > _POINT_CELL * depth or turn > 1 for away, turn in errors)
+        if likeness > 0 and is_new:
             found.append(poses[n])
     return found[:_MOST_REPEATS]
 
@@ -134,15 +144,17 @@ def _find_common(steps: Float, least: int, most: int) -> Iterator[Rows]:
         return
     cells = np.floor(steps).astype(np.int64)
     cells -= cells.min(0)
-    kind = np.unique(np.ravel_multi_index(tuple(cells.T), tuple(cells.max(0) + 1)), return_inverse=True)[1]
+    numbers = np.ravel_multi_index(tuple(cells.T), tuple(cells.max(0) + 1))
+    _, kind = np.unique(numbers, return_inverse=True)
     left = np.ones(len(steps), bool)
     for _ in range(most):
         commonest = int(np.argmax(np.bincount(kind[left])))
-        centre = np.median(steps[left & (kind == commonest)], 0)
+        is_commonest = kind == commonest
+        centre = np.median(steps[left & is_commonest], 0)
         near = left & (np.abs(steps - centre) <= 1).all(1)
         if near.sum() >= least:
             yield np.flatnonzero(near)
-        left &= ~near & (kind != commonest)
+        left &= ~near & ~is_commonest
         if left.sum() < least:
             return
 
@@ -152,39 +164,46 @@ class _Resemblance:
 
     def __init__(self, out: Rendered, camera: Camera, config: RegisterConfig) -> None:
         share = min(1.0, _SELF_SIDE / max(camera.width, camera.height))
-        self._size = width, height = round(camera.width * share), round(camera.height * share)
+        width = round(camera.width * share)
+        height = round(camera.height * share)
         planes = np.dstack([grey_of(np.clip(out.image, 0, 1)), out.alpha >= config.min_alpha])
         small = resize(planes.astype(np.float32), (width, height)).astype(np.float64)
+        self._size = width, height
         self._grey = band_passed(small[..., 0])
         self._mask = small[..., 1] > 0.999
         self._scale = np.array([width / camera.width, height / camera.height])
         self._camera = camera
         v, u = np.nonzero(self._mask)
-        at = (np.stack([u, v], 1) + 0.5) / self._scale
+        at = (np.stack([u, v], 1) + 0.5) / self._scale  # in pixels of the camera
         column, row = at.astype(int).T
-        z = out.depth[row, column].astype(np.float64)
+        depth = out.depth[row, column].astype(np.float64)
         K = camera.K
-        rays = np.stack([(at[:, 0] - K[0, 2]) / K[0, 0], (at[:, 1] - K[1, 2]) / K[1, 1], np.ones(len(at))], 1)
-        self._seen = rays * z[:, None]
+        x = (at[:, 0] - K[0, 2]) / K[0, 0]
+        y = (at[:, 1] - K[1, 2]) / K[1, 1]
+        rays = np.stack([x, y, np.ones(len(at))], 1)
+        self._seen = rays * depth[:, None]
         self._here = self._grey[v, u]
 
     def of(self, pose: Float) -> float:
         """Return the ZNCC times the square root of the share of pixels compared; 0 where it is too low."""
         motion = pose @ np.linalg.inv(self._camera.viewmat)
-        X = self._seen @ motion[:3, :3].T + motion[:3, 3]
-        ahead = X[:, 2] > 1e-3 * np.abs(self._seen[:, 2])
+        moved = self._seen @ motion[:3, :3].T + motion[:3, 3]
+        ahead = moved[:, 2] > 1e-3 * np.abs(self._seen[:, 2])
+        depth = np.where(ahead, moved[:, 2], 1)
         K = self._camera.K
-        depth = np.where(ahead, X[:, 2], 1)
-        uv = X[:, :2] / depth[:, None] * [K[0, 0], K[1, 1]] + K[:2, 2]
-        column, row = np.floor(np.clip(uv * self._scale, -1, 1e6)).astype(int).T
-        inside = ahead & (column >= 0) & (row >= 0) & (column < self._size[0]) & (row < self._size[1])
+        pixels = moved[:, :2] / depth[:, None] * [K[0, 0], K[1, 1]] + K[:2, 2]
+        column, row = np.floor(np.clip(pixels * self._scale, -1, 1e6)).astype(int).T
+        width, height = self._size
+        inside = ahead & (column >= 0) & (row >= 0) & (column < width) & (row < height)
         inside[inside] = self._mask[row[inside], column[inside]]
         share = float(inside.sum()) / max(1, len(inside))
-        if share < _SELF_LIKE[1]:
+        if share < _LEAST_COMPARED:
             return 0.0
         there = self._grey[row[inside], column[inside]]
         likeness = zncc(self._here[inside], there, np.ones(len(there), bool))
-        return likeness * float(np.sqrt(share)) if likeness >= _SELF_LIKE[0] else 0.0
+        if likeness < _SELF_LIKE:
+            return 0.0
+        return likeness * float(np.sqrt(share))
 
 
 def preference(photo: Float, mask: Mask, a: Look, b: Look, config: RegisterConfig) -> float:
@@ -194,34 +213,45 @@ def preference(photo: Float, mask: Mask, a: Look, b: Look, config: RegisterConfi
     of the pixels where the renders agree.
     """
     usual = photo[mask].mean(0)
-    both = mask & a.mask & b.mask
-    slope = np.max([np.hypot(*np.gradient(a.image[..., c])) for c in range(3)], axis=0)
-    differ = np.abs(a.image - b.image).max(2) > _AGREEING + _MISALIGNED * slope
-    agree = both & ~differ
+    slopes = [np.hypot(*np.gradient(a.image[..., c])) for c in range(3)]
+    allowed = _AGREEING + _MISALIGNED * np.max(slopes, axis=0)
+    differ = np.abs(a.image - b.image).max(2) > allowed
+    both = a.mask & b.mask
+    agree = mask & both & ~differ
     if agree.sum() < 0.02 * mask.sum():
-        agree = both
+        agree = mask & both
     if not agree.any():
         return 0.0
     mean = ((a.image + b.image) / 2)[agree]
     seen = photo[agree]
-    spread = np.maximum(((mean - mean.mean(0)) ** 2).mean(0), 1e-6)
-    gain = np.clip(((mean - mean.mean(0)) * (seen - seen.mean(0))).mean(0) / spread, 0.1, 10)
-    bias = seen.mean(0) - gain * mean.mean(0)
+    gain, bias = _fit_light(mean, seen)
     residual = np.zeros(mask.shape)
     residual[agree] = ((seen - gain * mean - bias) ** 2).sum(1)
     noise = max(float(residual[agree].mean()) / 3, _LEAST_NOISE**2)
     side = max(1, max(mask.shape) // _THING)
     sums = side * side * box_mean(residual, min(side, *mask.shape))
     thing = float(sums.max() - np.median(sums))
-    first, second = (np.where(each.mask[..., None], gain * each.image + bias, usual) for each in (a, b))
-    counts = mask & np.where(a.mask & b.mask, differ, a.mask | b.mask)
-    D = (first - second)[counts]
-    energy = float((D * D).sum())
+    first = np.where(a.mask[..., None], gain * a.image + bias, usual)
+    second = np.where(b.mask[..., None], gain * b.image + bias, usual)
+    counts = mask & np.where(both, differ, a.mask | b.mask)
+    difference = (first - second)[counts]
+    energy = float((difference * difference).sum())
     if energy < 1e-9:
         return 0.0
-    share = float((D * (photo[counts] - (first + second)[counts] / 2)).sum()) / energy
+    unexplained = photo[counts] - (first + second)[counts] / 2
+    share = float((difference * unexplained).sum()) / energy  # λ − ½
     sigma = np.sqrt(_MODEL_SIGMA**2 + (3 * config.window**2 * noise + thing / 12) / energy)
     return float(share / sigma)
+
+
+def _fit_light(rendered: Float, photo: Float) -> tuple[Float, Float]:
+    """Return the (3,) gain and bias with which (M, 3) rendered colours are nearest to a photo's."""
+    centre = rendered.mean(0)
+    offsets = rendered - centre
+    spread = np.maximum((offsets**2).mean(0), 1e-6)
+    covariance = (offsets * (photo - photo.mean(0))).mean(0)
+    gain = np.clip(covariance / spread, 0.1, 10)
+    return gain, photo.mean(0) - gain * centre
 
 
 def decisive(preference: float) -> bool:
