@@ -169,7 +169,7 @@ def _here(words: list[str], cwd: Path, env: dict[str, str]) -> Said:
 
 _USUAL_VIEWS = {"test_floors", "test_generated_views", "test_notes", "test_stopped_runs"}
 """Modules whose generated views have the usual size, as their numbers and kinds depend on it."""
-_UNSCORED = {"cli", "levels", "report", "tiles", "viewer", "test_documented_commands"}
+_UNSCORED = {"cli", "levels", "report", "viewer", "tests/test_documented_commands", "tiles/test_distill"}
 """Folders and modules whose tests ask for no score, or compare scores in equal views: any views will do."""
 
 
@@ -181,8 +181,9 @@ def shared_plans(request: pytest.FixtureRequest) -> Iterator[None]:
             if request.path.stem in _USUAL_VIEWS:
                 share_plans(patches)
             else:
-                unscored = {request.path.parent.name, request.path.stem} & _UNSCORED
-                plan_small_scenes(patches, coarse=bool(unscored))
+                folder = request.path.parent.name
+                coarse = bool({folder, f"{folder}/{request.path.stem}"} & _UNSCORED)
+                plan_small_scenes(patches, coarse=coarse)
         yield
 
 
