@@ -3,7 +3,8 @@
 import json
 import signal
 import threading
-from collections.abc import Iterator
+import zipfile
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
@@ -23,12 +24,21 @@ PERIOD = 60.0
 """Seconds between two checkpoints."""
 
 
-def save(path: Path, key: str, meta: dict[str, Any], arrays: dict[str, Values]) -> None:
-    """Write a checkpoint; `key` identifies the run."""
+def save(
+    path: Path, key: str, meta: dict[str, Any], arrays: Mapping[str, Values | Callable[[], Values]]
+) -> None:
+    """Write a checkpoint as an .npz file.
+
+    Args:
+        key: identifies the run.
+        arrays: or functions that return them, called one after the other.
+    """
     text = json.dumps({"key": key, **meta}, default=plain)
-    everything: dict[str, Any] = {"meta": np.array(text), **arrays}
-    with atomic_output(path, overwrite=True) as temporary:
-        np.savez(temporary, **everything)
+    everything = {"meta": np.array(text), **arrays}
+    with atomic_output(path, overwrite=True) as temporary, zipfile.ZipFile(temporary, "w") as archive:
+        for name, array in everything.items():
+            with archive.open(f"{name}.npy", "w", force_zip64=True) as file:
+                np.lib.format.write_array(file, array() if callable(array) else array, allow_pickle=False)
 
 
 def load(path: Path, key: str) -> tuple[dict[str, Any], dict[str, Any]]:

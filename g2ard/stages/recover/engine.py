@@ -1,6 +1,8 @@
 """Objective of recovery's engines, and the engine in Rust or on a GPU, which runs whole steps."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -168,9 +170,17 @@ class FusedEngine:
             shN=shN,
         )
 
-    def state(self) -> dict[str, Values]:
-        """Return everything that a bitwise resume needs."""
-        return {**self._trainer.state(), "skipped": np.array(self.skipped)}
+    def state(self) -> dict[str, Values | Callable[[], Values]]:
+        """Return everything that a bitwise resume needs.
+
+        Functions return the large arrays, so that a checkpoint holds one at a time.
+        """
+        rest = self._trainer.state("rest")
+        large = {part: partial(self._export, part) for part in ("values", "first", "second")}
+        return {**rest, **large, "skipped": np.array(self.skipped)}
+
+    def _export(self, part: str) -> Values:
+        return self._trainer.state(part)[part]
 
     def load(self, state: dict[str, Values]) -> None:
         self._skipped_before = int(state["skipped"]) - self._trainer.skipped

@@ -2,8 +2,8 @@
 
 use g2ard_core::raster::{Camera, Settings};
 use g2ard_core::train::{
-    Attribute, Biases, Exported, Rates, Regularizers, StepInput, Train, TrainKernels, Trainer,
-    step_rows,
+    Attribute, Biases, Exported, Part, Rates, Regularizers, StepInput, Train, TrainKernels,
+    Trainer, step_rows,
 };
 use g2ard_core::{Error, Result};
 use numpy::{
@@ -234,10 +234,24 @@ impl PyTrainer {
         Ok(steps.into_pyarray(py))
     }
 
-    /// Return everything that a bitwise resume needs: a dict of arrays.
-    fn state<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
+    /// Return everything that a bitwise resume needs: a dict of arrays; or only "values", "first" or "second", where the
+    /// other arrays are empty, or the "rest".
+    #[pyo3(signature = (part = None))]
+    fn state<'py>(&self, py: Python<'py>, part: Option<&str>) -> PyResult<Bound<'py, PyDict>> {
+        let part = match part {
+            None => None,
+            Some("values") => Some(Part::Values),
+            Some("first") => Some(Part::First),
+            Some("second") => Some(Part::Second),
+            Some(_) => Some(Part::Rest),
+        };
         let trained = work::locked(py, &self.trained);
-        let state = work::quick(py, || noted(trained.inner.export()))?;
+        let state = work::quick(py, || {
+            noted(match part {
+                None => trained.inner.export(),
+                Some(part) => trained.inner.export_part(part),
+            })
+        })?;
         let dict = [
             ("values", state.values.into_pyarray(py)),
             ("first", state.first.into_pyarray(py)),

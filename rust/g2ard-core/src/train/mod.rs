@@ -16,7 +16,7 @@ mod tests;
 pub use adam::{BETA2, Biases, EPSILON, GRADIENT_MAX};
 pub use anchors::{Anchors, Regularizers, anchor_rows};
 pub use row_major::{Attribute, step_rows};
-pub use store::{Exported, Store};
+pub use store::{Exported, Part, Store};
 
 use rayon::prelude::*;
 
@@ -138,6 +138,11 @@ pub trait Train: Send + Sync {
 
     /// Everything that [`Train::import`] needs.
     fn export(&self) -> Result<Exported>;
+
+    /// At least one part of it, so that a checkpoint need not hold both moments at once.
+    fn export_part(&self, _part: Part) -> Result<Exported> {
+        self.export()
+    }
 
     /// Restore an earlier export; training then continues bit for bit, except on another device.
     fn import(&mut self, state: &Exported) -> Result<()>;
@@ -321,6 +326,10 @@ impl Train for Trainer {
 
     fn export(&self) -> Result<Exported> {
         Ok(self.store.export())
+    }
+
+    fn export_part(&self, part: Part) -> Result<Exported> {
+        Ok(self.store.export_part(part))
     }
 
     fn import(&mut self, state: &Exported) -> Result<()> {

@@ -47,6 +47,15 @@ pub struct Exported {
     pub order: Vec<u32>,
 }
 
+/// What of an [`Exported`] is wanted; the moments and the values are its large arrays.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Part {
+    Values,
+    First,
+    Second,
+    Rest,
+}
+
 impl Exported {
     /// Check the lengths, and that `order` is a permutation.
     pub fn validate(&self, rows: usize, attributes: usize) -> Result<()> {
@@ -190,20 +199,38 @@ impl Store {
         steps
     }
 
-    /// Everything that [`Store::import`] needs.
-    pub fn export(&self) -> Exported {
-        let all = self.attributes();
+    /// One part of what [`Store::import`] needs; the rest is empty.
+    pub fn export_part(&self, part: Part) -> Exported {
+        let rows = |blocks| self.unblock(blocks, 0, self.attributes());
+        let mut exported = Exported::default();
+        match part {
+            Part::Values => exported.values = rows(&self.values),
+            Part::First => exported.first = rows(&self.first),
+            Part::Second => exported.second = rows(&self.second),
+            Part::Rest => {
+                exported.units = self.units();
+                exported.steps = self.steps();
+                exported.order = self.order.clone();
+            }
+        }
+        exported
+    }
+
+    fn units(&self) -> Vec<f32> {
         let mut units = vec![0.0; self.rows];
         for row in 0..self.rows {
             units[self.order[row] as usize] = self.units[row / LANES].0[row % LANES];
         }
+        units
+    }
+
+    /// Everything that [`Store::import`] needs.
+    pub fn export(&self) -> Exported {
         Exported {
-            values: self.unblock(&self.values, 0, all),
-            first: self.unblock(&self.first, 0, all),
-            second: self.unblock(&self.second, 0, all),
-            units,
-            steps: self.steps(),
-            order: self.order.clone(),
+            values: self.export_part(Part::Values).values,
+            first: self.export_part(Part::First).first,
+            second: self.export_part(Part::Second).second,
+            ..self.export_part(Part::Rest)
         }
     }
 
@@ -213,7 +240,7 @@ impl Store {
         let n = self.rows;
         self.order.clone_from(&state.order);
         let [mut values, mut first, mut second] =
-            [&self.values, &self.first, &self.second].map(|v| vec![Lanes16::default(); v.len()]);
+            [&mut self.values, &mut self.first, &mut self.second].map(std::mem::take);
         self.block(&state.values, &mut values);
         self.block(&state.first, &mut first);
         self.block(&state.second, &mut second);
