@@ -200,25 +200,29 @@ def _find_in_frame(points: Float, camera: Camera, depths: Float32) -> tuple[Rows
     with np.errstate(divide="ignore", invalid="ignore"):
         u = np.floor(camera.K[0, 0] * x / z + camera.K[0, 2])
         v = np.floor(camera.K[1, 1] * y / z + camera.K[1, 2])
-    rows = np.flatnonzero((z > 0) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height))
-    return rows, z[rows], depths[v[rows].astype(int), u[rows].astype(int)]
+    inside = (z > 0) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
+    rows = np.flatnonzero(inside)
+    surface = depths[v[rows].astype(int), u[rows].astype(int)]
+    return rows, z[rows], surface
 
 
 def extent_of(splats: Splats) -> tuple[list[float], float]:
     """Return the median of the means, and the radius around it that holds 99 % of them."""
     means = splats.means.astype(np.float64)
     middle = np.median(means, axis=0)
-    return middle.tolist(), float(np.percentile(np.linalg.norm(means - middle, axis=1), 99))
+    away = np.linalg.norm(means - middle, axis=1)
+    return middle.tolist(), float(np.percentile(away, 99))
 
 
 def _mark_giants(splats: Splats, middle: Sequence[float], radius: float) -> Mask:
     """Mark Gaussians larger than the scene, with its middle within 3σ."""
-    means = splats.means.astype(np.float64)
     large = np.flatnonzero(splats.scales.max(axis=1) > radius)
-    local = np.einsum("nji,nj->ni", rotation_matrices(splats.quats[large]), np.asarray(middle) - means[large])
-    local /= np.maximum(splats.scales[large].astype(np.float64), 1e-30)
+    offsets = np.asarray(middle) - splats.means.astype(np.float64)[large]
+    local = np.einsum("nji,nj->ni", rotation_matrices(splats.quats[large]), offsets)
+    local /= np.maximum(splats.scales[large].astype(np.float64), 1e-30)  # in standard deviations
+    within = np.linalg.norm(local, axis=1) <= _FOOTPRINT_SIGMAS
     out = np.zeros(len(splats), bool)
-    out[large[np.linalg.norm(local, axis=1) <= _FOOTPRINT_SIGMAS]] = True
+    out[large[within]] = True
     return out
 
 
@@ -237,13 +241,14 @@ def _mark_needles(splats: Splats, rest: Mask, progress: Progress) -> Mask:
     ends = np.concatenate([means[long] - mean_to_end, means[long] + mean_to_end])
     points = np.concatenate([means[rows], ends])
     found = _core.knn(np.ascontiguousarray(points), _NEIGHBORS, counter(progress, "neighbours"))
-    near = found[len(rows) :].astype(np.int64)
-    real = near < len(rows)
-    other = rows[np.where(real, near, 0)]
-    covered = real & (other != np.tile(long, 2)[:, None])
+    near = found[len(rows) :].astype(np.int64)  # of the ends
+    is_mean = near < len(rows)
+    other = rows[np.where(is_mean, near, 0)]
+    is_other = is_mean & (other != np.tile(long, 2)[:, None])
     away = np.linalg.norm(means[other] - ends[:, None], axis=2)
-    covered &= away <= _FOOTPRINT_SIGMAS * splats.scales[other].max(axis=2)
-    out[long[~covered.any(axis=1).reshape(2, -1).any(axis=0)]] = True
+    reach = _FOOTPRINT_SIGMAS * splats.scales[other].max(axis=2)
+    covered = (is_other & (away <= reach)).any(axis=1)  # per end
+    out[long[~covered.reshape(2, -1).any(axis=0)]] = True
     return out
 
 

@@ -155,7 +155,9 @@ def lifted(out: Rendered, camera: Camera, uv: Float, config: RegisterConfig) -> 
     known &= depths.max(0) - nearest <= config.max_edge * nearest
     K = camera.K
     T = camera.viewmat
-    seen = np.stack([(uv[:, 0] - K[0, 2]) / K[0, 0] * z, (uv[:, 1] - K[1, 2]) / K[1, 1] * z, z], 1)
+    x = (uv[:, 0] - K[0, 2]) / K[0, 0] * z
+    y = (uv[:, 1] - K[1, 2]) / K[1, 1] * z
+    seen = np.stack([x, y, z], 1)
     return np.einsum("mi,ij->mj", seen - T[:3, 3], T[:3, :3], optimize=False), known
 
 
@@ -219,14 +221,11 @@ def with_focal(
         if wider == prior:
             break
         prior = wider
-    before, after = (np.median(np.abs(_project(c.viewmat, c.K, points) - uv)) for c in (camera, here))
+    before = np.median(np.abs(_project(camera.viewmat, camera.K, points) - uv))
+    after = np.median(np.abs(_project(here.viewmat, here.K, points) - uv))
     if not after < before + config.max_reprojection:  # diverged
-        return (
-            camera,
-            config.focal_sigma,
-            information(camera.viewmat, camera.K, uv, points)[0] / config.alike,
-            alone,
-        )
+        data, _ = information(camera.viewmat, camera.K, uv, points)
+        return camera, config.focal_sigma, data / config.alike, alone
     return here, prior, data, alone
 
 
@@ -247,8 +246,9 @@ def information(T: Float, K: Float, uv: Float, points: Float) -> tuple[Float, Fl
     sigma = max(_LEAST_MATCH_SIGMA, _SIGMA_OF_MAD * float(np.median(np.abs(residual))))
     weight = 1 / (1 + (residual**2).sum(1) / sigma**2)
     J = np.concatenate([right, down], 1)
-    weights = np.concatenate([weight, weight]) / sigma**2
-    return np.einsum("in,jn->ij", J * weights, J, optimize=False), (J * weights) @ residual.T.ravel()
+    weighted = J * (np.concatenate([weight, weight]) / sigma**2)
+    squares = np.einsum("in,jn->ij", weighted, J, optimize=False)
+    return squares, weighted @ residual.T.ravel()
 
 
 def _project(T: Float, K: Float, points: Float) -> Float:

@@ -76,24 +76,26 @@ def outlooks(cells: Surface, cameras: Cameras) -> tuple[Float, Float]:
     shares = np.zeros(len(local))
     columns, rows = _DEPTH_GRID
     for i in range(len(local)):
+        width = local.widths[i]
+        height = local.heights[i]
+        K = local.Ks[i]
         x, y, z = local.viewmats[i, :3, :3] @ cells.centers.T + local.viewmats[i, :3, 3:]
         ahead = z > 0
         z = np.where(ahead, z, 1.0)
-        K = local.Ks[i]
         u = K[0, 0] * x / z + K[0, 2]
         v = K[1, 1] * y / z + K[1, 2]
-        inside = ahead & (u >= 0) & (u < local.widths[i]) & (v >= 0) & (v < local.heights[i])
-        if inside.any():
-            u = u[inside]
-            v = v[inside]
-            z = z[inside]
-            row = (v * rows / local.heights[i]).astype(int)
-            column = (u * columns / local.widths[i]).astype(int)
-            place = row * columns + column
-            nearest = np.full(columns * rows, np.inf)
-            np.minimum.at(nearest, place, z)
-            depths[i] = np.median(z)
-            shares[i] = np.count_nonzero(z < _HIDDEN_DEPTH_RATIO * nearest[place]) / len(cells.centers)
+        inside = ahead & (u >= 0) & (u < width) & (v >= 0) & (v < height)
+        if not inside.any():
+            continue
+        z = z[inside]
+        row = (v[inside] * rows / height).astype(int)
+        column = (u[inside] * columns / width).astype(int)
+        place = row * columns + column
+        nearest = np.full(columns * rows, np.inf)
+        np.minimum.at(nearest, place, z)
+        visible = z < _HIDDEN_DEPTH_RATIO * nearest[place]
+        depths[i] = np.median(z)
+        shares[i] = np.count_nonzero(visible) / len(cells.centers)
     return depths, shares
 
 
@@ -156,18 +158,20 @@ def facility_location(alike: Float, pose_weights: Float, usable: Mask, shares: F
     """
     away = bandwidths_apart(alike)
     worth = shares**_SCENE_SHARE_EXPONENT
-    best = np.zeros(len(alike))
+    best = np.zeros(len(alike))  # likeness of each candidate to the chosen view that is most like it
     left = usable.copy()
-    nearest = np.where(usable, np.inf, -np.inf)
+    nearest = np.where(usable, np.inf, -np.inf)  # distance to the nearest chosen view
     order: list[int] = []
     for _ in range(int(usable.sum())):
         if not order:
-            view = int(np.argmax(np.where(left, worth / np.maximum(pose_weights @ away, 1e-12), -1.0)))
+            spread = np.maximum(pose_weights @ away, 1e-12)
+            gains = np.where(left, worth / spread, -1.0)
         elif nearest.max() > _KERNEL_REACH:
-            view = int(np.argmax(worth * np.where(nearest > _KERNEL_REACH, nearest, 0.0)))
+            gains = worth * np.where(nearest > _KERNEL_REACH, nearest, 0.0)
         else:
             added = pose_weights @ np.maximum(alike - best[:, None], 0.0)
-            view = int(np.argmax(np.where(left, worth * added, -1.0)))
+            gains = np.where(left, worth * added, -1.0)
+        view = int(np.argmax(gains))
         order.append(view)
         best = np.maximum(best, alike[:, view])
         nearest = np.minimum(nearest, away[view])
