@@ -30,12 +30,14 @@ from g2ard.stages.simplify.gaps import let_through, some_views
 from g2ard.stages.simplify.pairs import MANY
 from g2ard.system.cached import cached_property
 from g2ard.system.keys import key_of
+from g2ard.tiles.clutter import clutter
 from g2ard.tiles.executor import Workers
+from g2ard.tiles.images import draw, wide
 from g2ard.tiles.ingest import ingest
 from g2ard.tiles.merging import Merged, scene_in_tiles, simplify_tiles
 from g2ard.tiles.sights import boxes_of, levels_of, written
 from g2ard.tiles.simplify import TiledRun
-from g2ard.tiles.tasks import Task, load
+from g2ard.tiles.tasks import load
 
 _VIEWS_PER_TASK = 32
 """Views that a task draws together, so that a tile is read once for them."""
@@ -83,7 +85,7 @@ class InTiles:
     @cached_property
     def wide(self) -> list[Path]:
         """Files of the Gaussians of each tile that reach far, see `g2ard.tiles.images`."""
-        return self._run.each("wide", "wide", module="g2ard.tiles.images")
+        return self._run.each(wide, "wide", [{}] * len(self._run.sizes))
 
     def identity(self) -> list[str]:
         """Return the key of the tiles."""
@@ -146,15 +148,15 @@ class InTiles:
 
     def without_clutter(self, views: Cameras) -> tuple[InMemory | InTiles, Cleaning, float]:
         """Return the scene without the clutter that views show, what that is, and its share of the light."""
-        run, extent = self._run, extent_of(self.sample)
-        boxes, shown = boxes_of(run.coarse), written(self.workers.folder, views)
-        files = run.each(
-            "clutter",
-            "clutter",
-            per_tile=[{"levels": levels_of(boxes, tile), "extent": extent} for tile in range(len(boxes))],
-            inputs=[{"coarse": run.coarse, "views": shown}] * len(boxes),
-            module="g2ard.tiles.clutter",
-        )
+        coarse = self._run.coarse
+        boxes = boxes_of(coarse)
+        common = {
+            "coarse": coarse,
+            "cameras": written(self.workers.folder, views),
+            "extent": extent_of(self.sample),
+        }
+        given = ({**common, "levels": levels_of(boxes, tile)} for tile in range(len(boxes)))
+        files = self._run.each(clutter, "clutter", given)
         found = [Cleaning(load(path, "kind")[0]) for path in files]
         light, gone = np.sum([load(path, "light")[0] for path in files], axis=0)
 
@@ -211,32 +213,24 @@ class TileRenders(Cached):
         missing = [int(view) for view in views if view not in self._files]
         if not missing:
             return
-        store, workers = self._scene.store, self._scene.workers
-        shown = written(workers.folder, self.cameras)
+        store = self._scene.store
+        workers = self._scene.workers
         positions = self.cameras.positions - store.offset
         alike = sorted(missing, key=lambda view: front_to_back(store.tree, positions[view]))
-        chunks = math.ceil(len(alike) / _VIEWS_PER_TASK)
-        files = self._scene.wide
-        tasks = [
-            Task(
-                "g2ard.tiles.images:draw",
-                f"images-{number:05}",
-                workers.folder,
-                {
-                    "store": store.key,
-                    "views": [int(view) for view in chunk],
-                    "near": self._scene.settings.near_of(0),
-                    "background": list(self._background),
-                    "opacity": self._opacity,
-                },
-                {"views": shown, "wide": files},
-                {"store": store.folder},
-                len(chunk),
-            )
-            for number, chunk in enumerate(np.array_split(alike, chunks))
-        ]
-        for task, path in zip(tasks, workers.run(tasks, "targets"), strict=True):
-            self._files |= dict.fromkeys(task.arguments["views"], path)
+        common = {
+            "content": store.key,
+            "cameras": written(workers.folder, self.cameras),
+            "wide": self._scene.wide,
+            "near": self._scene.settings.near_of(0),
+            "background": self._background,
+            "opacity": self._opacity,
+        }
+        parts = np.array_split(alike, math.ceil(len(alike) / _VIEWS_PER_TASK))
+        chunks = [part.tolist() for part in parts]
+        calls = [({**common, "views": chunk}, len(chunk)) for chunk in chunks]
+        files = workers.map(draw, "targets", calls, {"store": store.folder})
+        for chunk, path in zip(chunks, files, strict=True):
+            self._files |= dict.fromkeys(chunk, path)
 
     def _make(self, view: int) -> NDArray[Any]:
         if view not in self._files:

@@ -6,7 +6,7 @@ import platform
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import ExitStack, closing, contextmanager, suppress
@@ -22,7 +22,7 @@ from g2ard.io.atomic import drop_temporaries
 from g2ard.progress import Progress, silent
 from g2ard.system.keys import key_of
 from g2ard.system.peak_memory import forget_workers, note_worker, peak_rss
-from g2ard.tiles.tasks import Task, run_task
+from g2ard.tiles.tasks import Arrays, Given, Task, run_task
 
 _MOST_WORKER_DEATHS = 5
 """Worker deaths in a row, without a finished task, before giving up. Dask gives up a task after four."""
@@ -83,6 +83,26 @@ class Workers:
                     )
         self.progress(stage, total, total)
         return [task.output for task in tasks]
+
+    def map(
+        self,
+        function: Callable[[Given], Arrays],
+        stage: str,
+        calls: Iterable[tuple[Given, int]],
+        places: Given,
+    ) -> list[Path]:
+        """Run the calls of a function, each with its cost, that are not done; return their files, in order.
+
+        Args:
+            calls: what is given to each, see `Task`, and its cost.
+            places: given to all.
+        """
+        name = f"{function.__module__}:{function.__name__}"
+        tasks = [
+            Task(name, f"{stage}-{number:05}", self.folder, given, places, cost)
+            for number, (given, cost) in enumerate(calls)
+        ]
+        return self.run(tasks, stage)
 
     def _round(self, todo: Sequence[Task], stage: str, total: int) -> None:
         before = total - sum(task.cost for task in todo)

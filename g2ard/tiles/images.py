@@ -17,16 +17,7 @@ from g2ard.rendering.targets import rounded
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats
 from g2ard.scene.transform import join
-from g2ard.tiles.tasks import (
-    Arguments,
-    Arrays,
-    Inputs,
-    Places,
-    arrays_of,
-    cameras_of,
-    scene_of,
-    tell_share,
-)
+from g2ard.tiles.tasks import Arrays, Given, arrays_of, cameras_of, scene_of, tell_share
 
 _WIDTHS = 5.0
 """Largest standard deviations from its middle at which a Gaussian has α ≥ 1/255: 3.33 in the image, and up to
@@ -36,37 +27,35 @@ _BLUR_PIXELS = 1.9
 """Pixels by which the renderer's blur widens that reach."""
 
 
-def wide(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
+def wide(given: Given) -> Arrays:
     """Select the Gaussians of a tile that may reach beyond half of the margin.
 
     Args:
-        arguments: `tile`.
-        places: `store`, as for all functions here.
+        given: `tile`; `store`, as for all functions here.
 
     Returns:
         `scene` (`scene_of`).
     """
-    store = TileStore.open(places["store"])
-    scene = store.read(arguments["tile"])
+    store = TileStore.open(given["store"])
+    scene = store.read(given["tile"])
     return arrays_of(scene.take(_WIDTHS * scene.scales.max(axis=1, initial=0) > store.margin / 2), "scene")
 
 
-def draw(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
+def draw(given: Given) -> Arrays:
     """Draw views of the whole scene.
 
     Args:
-        arguments: `views`, numbers of cameras; `near`, the near plane; `background`; `opacity`, whether to
-            return that too.
-        inputs: `views`, cameras in world coordinates; `wide`, the output of `wide` for each tile.
+        given: `cameras`, in world coordinates; `views`, numbers of those to draw; `near`, the near plane;
+            `background`; `opacity`, whether to return that too; `wide`, the output of `wide` for each tile.
 
     Returns:
         One array per view, called by its number: (H, W, 3) uint16, see `rounded`, or with `opacity`
         (H, W, 4) float32, the image and its alpha.
     """
-    store = TileStore.open(places["store"])
-    numbers = arguments["views"]
-    cameras = cameras_of(inputs["views"]).take(numbers)
-    settings = RasterSettings(near=arguments["near"], antialiased=store.render_model == "antialiased")
+    store = TileStore.open(given["store"])
+    numbers = given["views"]
+    cameras = cameras_of(given["cameras"]).take(numbers)
+    settings = RasterSettings(near=given["near"], antialiased=store.render_model == "antialiased")
     canvases = [Canvas.blank(camera) for camera in cameras]
     boxes = store.tree.boxes() + store.offset
     ways = [front_to_back(store.tree, position - store.offset) for position in cameras.positions]
@@ -76,15 +65,15 @@ def draw(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
         lit = [view for view in here if canvases[view].light_on(boxes[tile]) >= FAINT]
         if lit:
             seen = cameras.take(lit)
-            scene = reaching_into(store, tile, seen, inputs["wide"])
+            scene = reaching_into(store, tile, seen, given["wide"])
             renderer = Renderer(scene, settings=settings)
             for view in lit:
                 canvases[view].draw(renderer, boxes[tile])
         for view in here:
             del ways[view][0]
         tell_share(1 - sum(map(len, ways)) / (len(ways) * len(boxes)))
-    finished = (canvas.finished(arguments["background"]) for canvas in canvases)
-    return {str(n): _stored(image, arguments["opacity"]) for n, image in zip(numbers, finished, strict=True)}
+    finished = (canvas.finished(given["background"]) for canvas in canvases)
+    return {str(n): _stored(image, given["opacity"]) for n, image in zip(numbers, finished, strict=True)}
 
 
 def _stored(drawn: NDArray[np.float32], opacity: bool) -> NDArray[Any]:

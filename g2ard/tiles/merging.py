@@ -20,7 +20,7 @@ from g2ard.stages.simplify.pairs import fit_opacities
 from g2ard.stages.simplify.reduce import SimplifyReport, SimplifyRound
 from g2ard.system.keys import key_of
 from g2ard.tiles.sights import Sights
-from g2ard.tiles.simplify import TiledRun
+from g2ard.tiles.simplify import TiledRun, merge, pair_plan, reduce, run_costs
 from g2ard.tiles.tasks import load, scene_of
 
 _HALF = 1 << 16
@@ -105,7 +105,7 @@ def simplify_tiles(
     sights = None if views is None else Sights(run, views, frame)
     if isinstance(run.method, Paper):
         counts = shares(run.sizes, budget)
-        merged = _reduced(run, counts, shares(run.sizes, final_budget or budget))
+        merged = _reduced(run, counts, shares(run.sizes, final_budget or budget), [{}] * len(counts))
     else:
         merged, counts = _merged(run, budget, frame if sights is None else sights.frame, sights)
     if sights is None:
@@ -166,50 +166,36 @@ def _merged(
     tiles = len(run.sizes)
     if budget < tiles:
         raise _unreached(tiles, budget, tiles, "one per tile")
-    visibility: list[dict[str, Any]] = (
-        [{"visibility": path} for path in sights.visibility] if sights else [{}] * tiles
-    )
+    seen = [{"visibility": path} for path in sights.visibility] if sights else [{}] * tiles
     mean_run = max(1.0, sum(run.sizes) / (run.config["morton_premerge_ratio"] * budget))
-    runs: list[dict[str, Any]] = [{"mean_run": mean_run}] * tiles
-    costs = run.each("run_costs", "costs", frame=frame, per_tile=runs, inputs=visibility)
+    given: list[dict[str, Any]] = [{"frame": frame, "mean_run": mean_run, **one} for one in seen]
+    costs = run.each(run_costs, "costs", given)
     runs_left, faint = _runs(run, costs, budget)
     if run.has_own_steps:
         counts = shares([n + f for n, f in zip(runs_left, faint, strict=True)], budget)
-        return _reduced(run, counts, counts, visibility), counts
-    ends = plan_ends(runs_left, budget)
-    plans = run.each(
-        "pair_plan",
-        "plans",
-        frame=frame,
-        per_tile=[{"runs": n, "last": end} for n, end in zip(runs_left, ends, strict=True)],
-        inputs=[{"costs": path, **seen} for path, seen in zip(costs, visibility, strict=True)],
-    )
+        return _reduced(run, counts, counts, seen), counts
+    for one, path, runs, end in zip(given, costs, runs_left, plan_ends(runs_left, budget), strict=True):
+        one |= {"costs": path, "runs": runs, "last": end}
+    plans = run.each(pair_plan, "plans", given)
     merges = cheapest([_costs_of(path) for path in plans], sum(runs_left) + sum(faint) - budget)
     counts = [n - m + f for n, m, f in zip(runs_left, merges, faint, strict=True)]
     if sum(counts) != budget:
         raise _unreached(sum(counts), budget, tiles, "what merging leaves of them")
-    merged = run.each(
-        "merge",
-        "merge",
-        frame=frame,
-        per_tile=[
-            {"runs": n, "merges": m, "faint": f} for n, m, f in zip(runs_left, merges, faint, strict=True)
-        ],
-        inputs=[{"plan": path, **seen} for path, seen in zip(plans, visibility, strict=True)],
-    )
-    return merged, counts
+    for one, path, number, rows in zip(given, plans, merges, faint, strict=True):
+        one |= {"plan": path, "merges": number, "faint": rows}
+    return run.each(merge, "merge", given), counts
 
 
 def _reduced(
-    run: TiledRun,
-    counts: Sequence[int],
-    final: Sequence[int],
-    inputs: list[dict[str, Any]] | None = None,
+    run: TiledRun, counts: Sequence[int], final: Sequence[int], seen: list[dict[str, Path]]
 ) -> list[Path]:
     """Reduce each tile alone to its count; return the results of `reduce`."""
     method = asdict(run.method)
-    given = [{"method": method, "count": n, "final": end} for n, end in zip(counts, final, strict=True)]
-    return run.each("reduce", "reduce", per_tile=given, inputs=inputs)
+    given = (
+        {"method": method, "count": count, "final": end, **one}
+        for count, end, one in zip(counts, final, seen, strict=True)
+    )
+    return run.each(reduce, "reduce", given)
 
 
 def shares(sizes: Sequence[int], budget: int) -> list[int]:

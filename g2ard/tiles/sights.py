@@ -14,8 +14,8 @@ from g2ard.rendering.visibility import LONGEST, MOST_VIEWS, NEAR, usual_and_othe
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.samples import evenly_spaced, weighted_quantile
 from g2ard.system.keys import key_of
-from g2ard.tiles.simplify import COARSE, TiledRun
-from g2ard.tiles.tasks import Task, is_whole, load, save, scene_of
+from g2ard.tiles.simplify import COARSE, TiledRun, light, merged_visibility, visibility
+from g2ard.tiles.tasks import is_whole, load, save, scene_of
 
 _LEAST_LIGHT_SHARE = 0.01
 """Share of a view's light from which it sees a tile."""
@@ -39,21 +39,21 @@ class Sights:
         self.usual = len(usual)
         self.others = len(others)
         self.cameras = Cameras.of([*usual, *others]).resized(LONGEST)
-        self.shrunk = float((self.cameras.widths[: self.usual] / usual.widths).mean())
-        self.views = written(run.workers.folder, self.cameras)
-        self.boxes = boxes_of(run.coarse)
-        light = self._light()
-        self.arguments = [
+        self.common = {"coarse": run.coarse, "cameras": written(run.workers.folder, self.cameras)}
+        boxes = boxes_of(run.coarse)
+        lit = self._light(boxes)
+        shrunk = float((self.cameras.widths[: self.usual] / usual.widths).mean())
+        self.given = [
             {
-                **self._chosen(light, tile),
-                "levels": levels_of(self.boxes, tile),
-                "shrunk": self.shrunk,
+                **self.common,
+                **self._chosen(lit, tile),
+                "frame": frame,
+                "levels": levels_of(boxes, tile),
+                "shrunk": shrunk,
             }
-            for tile in range(len(run.coarse))
+            for tile in range(len(boxes))
         ]
-        self.visibility = run.each(
-            "visibility", "visibility", frame=frame, per_tile=self.arguments, inputs=self._inputs()
-        )
+        self.visibility = run.each(visibility, "visibility", self.given)
         pixels = np.array([float(load(path, "pixel")[0]) for path in self.visibility])
         sums = np.array([load(path, "sums")[0] for path in self.visibility]).sum(axis=0)
         self.frame = frame
@@ -64,39 +64,25 @@ class Sights:
 
     def again(self, merged: list[Path]) -> list[Path]:
         """Measure what the same views see of the merged tiles."""
-        names = ("levels", "others", "others_weight")
-        levels = [{name: given[name] for name in names} for given in self.arguments]
-        inputs = [
+        inputs = (
             {**given, "merged": path, "visibility": seen}
-            for given, path, seen in zip(self._inputs(), merged, self.visibility, strict=True)
-        ]
-        return self.run.each("merged_visibility", "merged visibility", per_tile=levels, inputs=inputs)
+            for given, path, seen in zip(self.given, merged, self.visibility, strict=True)
+        )
+        return self.run.each(merged_visibility, "merged visibility", inputs)
 
-    def _light(self) -> NDArray[np.float64]:
+    def _light(self, boxes: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return (V, T) Σ αT² of each tile's coarse Gaussians in each view."""
-        coarse = self.run.coarse
         store = self.run.store
-        workers = self.run.workers
         here = self.cameras.recentred(store.offset)
         usual = here.positions[: self.usual, None]
-        away = np.linalg.norm(usual - self.boxes.mean(axis=1), axis=2).min(axis=1)
+        away = np.linalg.norm(usual - boxes.mean(axis=1), axis=2).min(axis=1)
         level = "near" if store.count // COARSE[0] <= _MOST_NEAR_GAUSSIANS else "far"
-        given = {"level": level, "near": NEAR * float(np.median(away)) or None}
-        tasks = [
-            Task(
-                "g2ard.tiles.simplify:light",
-                f"light-{number:05}",
-                workers.folder,
-                {"views": list(range(len(here)))[first : first + _VIEWS_PER_TASK], **given},
-                {"coarse": coarse, "views": self.views},
-                cost=min(_VIEWS_PER_TASK, len(here) - first),
-            )
-            for number, first in enumerate(range(0, len(here), _VIEWS_PER_TASK))
-        ]
-        return np.concatenate([load(path, "weights")[0] for path in workers.run(tasks, "light")])
-
-    def _inputs(self) -> list[dict[str, Any]]:
-        return [{"coarse": self.run.coarse, "views": self.views} for _ in self.run.coarse]
+        given = {**self.common, "level": level, "near": NEAR * float(np.median(away)) or None}
+        every = range(len(here))
+        parts = [list(every[first : first + _VIEWS_PER_TASK]) for first in every[::_VIEWS_PER_TASK]]
+        calls = [({**given, "views": views}, len(views)) for views in parts]
+        files = self.run.workers.map(light, "light", calls, {})
+        return np.concatenate([load(path, "weights")[0] for path in files])
 
     def _chosen(self, light: NDArray[np.float64], tile: int) -> dict[str, Any]:
         """Choose the views of a tile, evenly spaced among those that see it."""

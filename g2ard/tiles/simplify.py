@@ -2,20 +2,20 @@
 (`g2ard.tiles.tasks`).
 
 Between steps the tiles agree on a common frame for costs and on how many Gaussians each keeps
-(`g2ard.tiles.merging`). Common parameters:
+(`g2ard.tiles.merging`). What is given to all or most of them:
 
-- arguments: `tile`, its number; `config`, the fields of `Default` or `Fast`; `frame`, the values of the
-  common `_core.TileFrame`; `levels`, per tile the coarse scene ("near", "far") that represents it around it,
-  None for this tile.
-- inputs: `own`, the output of `coarse` for this tile (not for `coarse` itself); `coarse`, the same for every
-  tile; `views`, cameras in world coordinates; `visibility`, the output of `visibility` for this tile, absent
-  without views.
-- places: `store`, the folder of the tiled scene, the same for all functions that read the tile.
+- `store`, the folder of the tiled scene; `tile`, the number of the tile; `config`, the fields of `Default` or
+  `Fast`; `frame`, the values of the common `_core.TileFrame`.
+- `own`, the output of `coarse` for this tile (not for `coarse` itself); `coarse`, the same for every tile;
+  `levels`, per tile the coarse scene ("near", "far") that represents it around this one, None for this tile.
+- `cameras`, in world coordinates; `visibility`, the output of `visibility` for this tile, absent without
+  views.
 
 N counts the tile's rows with finite values; "ordered rows" are these in Morton order.
 """
 
 import math
+from collections.abc import Callable, Iterable
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -35,11 +35,8 @@ from g2ard.stages.simplify import Pairs, SimplifyConfig, simplify
 from g2ard.stages.simplify.pairs import emphasised, splats_of
 from g2ard.tiles.executor import Workers
 from g2ard.tiles.tasks import (
-    Arguments,
     Arrays,
-    Inputs,
-    Places,
-    Task,
+    Given,
     arrays_of,
     cameras_of,
     cropped,
@@ -68,25 +65,25 @@ _FRAME_SAMPLE = 1_000_000
 """Largest sample of Gaussians that determines a scene's frame."""
 
 
-def coarse(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
+def coarse(given: Given) -> Arrays:
     """Merge a tile to a few Gaussians, near and far, and sample its rows.
 
     Args:
-        arguments: `tile`, `config`; `sampled`, the rows of which one is in the sample.
+        given: `sampled`, the rows of which one is in the sample.
 
     Returns:
         Three scenes (`scene_of`): `near`, `far`, `sample`; `order`, (N,) the tile's rows in Morton order, and
         the `bounds` of that order.
     """
-    scene = tile_of(arguments, inputs, places)
+    scene = tile_of(given)
     # Regions to keep do not matter for other tiles' views.
-    config = replace(_config(arguments), keep_region=(), keep_times=Pairs.keep_times)
+    config = replace(_config(given), keep_region=(), keep_times=Pairs.keep_times)
     some = _widened(scene.take(scene.core.order[::_COARSE_STRIDE]), _COARSE_STRIDE)
     near = simplify(
         some, max(1, len(scene) // COARSE[0]), method="fast", config=config, progress=telling
     ).splats
     far = simplify(near, max(1, len(scene) // COARSE[1]), method="fast", config=config).splats
-    rows = scene.core.order[:: arguments["sampled"]]
+    rows = scene.core.order[:: given["sampled"]]
     return {
         **arrays_of(near, "near"),
         **arrays_of(far, "far"),
@@ -96,42 +93,40 @@ def coarse(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
     }
 
 
-def light(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
+def light(given: Given) -> Arrays:
     """Measure the light that views get from each tile, from coarse Gaussians.
 
     Args:
-        arguments: `views`, numbers of V cameras; `level`, the coarse scene used for all tiles; `near`, the
-            near plane, None for the renderer's default.
-        inputs: `coarse`, `views`.
+        given: `views`, numbers of V cameras; `level`, the coarse scene used for all tiles; `near`, the near
+            plane, None for the renderer's default.
 
     Returns:
         `weights`, (V, T) float64 Σ αT².
     """
-    parts = [scene_of(path, arguments["level"]) for path in inputs["coarse"]]
+    parts = [scene_of(path, given["level"]) for path in given["coarse"]]
     tiles = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
     scene = as_prepared(join(parts))
-    cameras = cameras_of(inputs["views"]).recentred(scene.offset)
-    settings = RasterSettings(antialiased=scene.antialiased, near=arguments["near"])
-    weights = np.zeros((len(arguments["views"]), len(parts)))
-    for row, view in enumerate(arguments["views"]):
+    cameras = cameras_of(given["cameras"]).recentred(scene.offset)
+    settings = RasterSettings(antialiased=scene.antialiased, near=given["near"])
+    weights = np.zeros((len(given["views"]), len(parts)))
+    for row, view in enumerate(given["views"]):
         sums = _core.VisibilityAccumulator(scene.core)
         sums.add([view_of(cameras, view, settings)], settings, None)
         weights[row] = np.bincount(tiles, sums.by_row()[0], len(parts))
     return {"weights": weights}
 
 
-def visibility(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
+def visibility(given: Given) -> Arrays:
     """Measure what the views see of a tile's Gaussians amid the whole scene.
 
     Views are rendered in rounds of sixteen until a round finds few new Gaussians; the sums are scaled up to
     represent all views.
 
     Args:
-        arguments: `tile`, `config`, `frame`, `levels`; `views`, numbers of the V usual views that see the
+        given: `views`, numbers of the V usual views that see the
             tile; `light`, (V,) Σ αT² that each gets from it (`light`); `all_light`, its sum over all usual
             views; `others`, numbers of views of other kinds; `others_weight`, that of each; `shrunk`, the
             ratio of these images' width to the full width.
-        inputs: `coarse`, `views`.
 
     Returns:
         `weight`, (N,) float32 Σ αT² over all views; `pixel_size`, (N,) float32 size of a full-image pixel,
@@ -140,29 +135,29 @@ def visibility(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
         numbers of the rendered views; `share`, their part of `all_light`, by which `weight` was divided;
         `near`, their near plane.
     """
-    own = tile_of(arguments, inputs, places, sh=False)
-    cameras = cameras_of(inputs["views"]).recentred(own.offset)
-    here = cameras.take(arguments["views"])
+    own = tile_of(given, sh=False)
+    cameras = cameras_of(given["cameras"]).recentred(own.offset)
+    here = cameras.take(given["views"])
     distance = np.median(np.linalg.norm(here.positions - own.core.origin, axis=1)) if len(here) else 0.0
     settings = RasterSettings(antialiased=own.antialiased, near=NEAR * float(distance) or None)
     here = cropped(here, own, settings)
-    amid = with_surroundings(own, arguments, inputs, places)
+    amid = with_surroundings(own, given)
     sums = _core.VisibilityAccumulator(amid.core)
     used = _add_until_converged(sums, here, settings, len(own))
-    share = np.asarray(arguments["light"])[used].sum() / arguments["all_light"] if used else 1.0
+    share = np.asarray(given["light"])[used].sum() / given["all_light"] if used else 1.0
     weight, pixel_size = (values[: len(own)] for values in sums.by_row())
-    weight = weight / np.float32(share or 1.0) + _of_others(own, amid, cameras, settings, arguments)
-    pixel_size = pixel_size * np.float32(arguments["shrunk"])  # in pixels of the full image
+    weight = weight / np.float32(share or 1.0) + _of_others(own, amid, cameras, settings, given)
+    pixel_size = pixel_size * np.float32(given["shrunk"])  # in pixels of the full image
     pixel = _median(pixel_size[np.isfinite(pixel_size) & (pixel_size > 0)])
-    unit, _, *others = arguments["frame"]  # with the tile's own pixel size
+    unit, _, *others = given["frame"]  # with the tile's own pixel size
     frame = _core.TileFrame(unit, 1.0 if math.isnan(pixel) else pixel, *others)
-    tile = _merging(own, _config(arguments), frame, SampledVisibility(weight, pixel_size))
+    tile = _merging(own, _config(given), frame, SampledVisibility(weight, pixel_size))
     return {
         "weight": weight,
         "pixel_size": pixel_size,
         "pixel": np.array(pixel),
         "sums": np.array(tile.sums()),
-        "used": np.array(arguments["views"], np.int64)[used],
+        "used": np.array(given["views"], np.int64)[used],
         "share": np.array(share or 1.0),
         "near": np.array(settings.near_of(0)),
     }
@@ -187,50 +182,47 @@ def _median(values: NDArray[np.float32]) -> float:
     return float(np.partition(values, middle)[middle]) if len(values) else math.nan
 
 
-def run_costs(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
+def run_costs(given: Given) -> Arrays:
     """Compute the costs of merging along Morton order.
 
     Args:
-        arguments: `tile`, `config`, `frame`; `mean_run`, the mean number of rows of a run, over all tiles.
-        inputs: `visibility`.
+        given: `mean_run`, the mean number of rows of a run, over all tiles.
 
     Returns:
         `costs`, (R − 1,) float32, one per gap between the R ordered rows that a renderer draws.
     """
-    scene = tile_of(arguments, inputs, places, sh=False)
-    return {"costs": _seen_tile(scene, arguments, inputs).run_costs(arguments["mean_run"])}
+    scene = tile_of(given, sh=False)
+    return {"costs": _seen_tile(scene, given).run_costs(given["mean_run"])}
 
 
-def pair_plan(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
+def pair_plan(given: Given) -> Arrays:
     """Plan merges to runs of Morton order, then of neighbouring pairs, beyond what the budget needs.
 
     Args:
-        arguments: `tile`, `config`, `frame`; `runs`, the number of runs; `last`, the Gaussians that remain
-            after all merges.
-        inputs: `visibility`; `costs`, the output of `run_costs`.
+        given: `runs`, the number of runs; `last`, the Gaussians that remain after all merges; `costs`, the
+            output of `run_costs`.
 
     Returns:
         `of`, (N,) uint32 the run of each ordered row, or `GONE`; `a`, `b`, (M,) merges in order: run b joins
         run a; `costs`, (M,) float32, each at least that of the merge before, because merges must be done in
         order.
     """
-    scene = tile_of(arguments, inputs, places)
-    config = _config(arguments)
-    runs = arguments["runs"]
-    last = arguments["last"]
+    scene = tile_of(given)
+    config = _config(given)
+    runs = given["runs"]
+    last = given["last"]
     counts = config.rounds(runs, last)
-    tile = _seen_tile(scene, arguments, inputs)
-    of, a, b, costs = tile.plan(runs, counts, load(inputs["costs"], "costs")[0])
+    tile = _seen_tile(scene, given)
+    of, a, b, costs = tile.plan(runs, counts, load(given["costs"], "costs")[0])
     return {"of": of, "a": a, "b": b, "costs": np.maximum.accumulate(costs) if len(costs) else costs}
 
 
-def merge(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
+def merge(given: Given) -> Arrays:
     """Apply the first merges of a tile's plan.
 
     Args:
-        arguments: `tile`, `config`, `frame`; `runs`, as for `pair_plan`; `merges`, the number to apply;
-            `faint`, the number of rows to keep that no renderer draws.
-        inputs: `plan`, the output of `pair_plan`; `visibility`.
+        given: `runs`, as for `pair_plan`; `plan`, its output; `merges`, the number to apply; `faint`, the
+            number of rows to keep that no renderer draws.
 
     Returns:
         `scene`, n = runs − merges + faint Gaussians (`scene_of`), opacities unfitted; `parents`, (N,) int32,
@@ -238,10 +230,10 @@ def merge(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
         number of clamped opacities; with views also `wanted`, (n,) Σ αT² of the members, and `unseen`, the
         number of rows that no view sees.
     """
-    scene = tile_of(arguments, inputs, places)
-    runs = arguments["runs"]
-    merges = arguments["merges"]
-    of, a, b = load(inputs["plan"], "of", "a", "b")
+    scene = tile_of(given)
+    runs = given["runs"]
+    merges = given["merges"]
+    of, a, b = load(given["plan"], "of", "a", "b")
     into = np.arange(runs)
     into[b[:merges]] = a[:merges]
     while not np.array_equal(into, further := into[into]):
@@ -249,79 +241,77 @@ def merge(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
     clusters, name = np.unique(into, return_inverse=True)
     dropped = of == GONE
     of = np.where(dropped, GONE, name[np.where(dropped, 0, of)]).astype(np.uint32)
-    out = _seen_tile(scene, arguments, inputs).assemble(of, len(clusters))
+    out = _seen_tile(scene, given).assemble(of, len(clusters))
     small = splats_of(scene, out)
-    if faint := np.flatnonzero(dropped)[: arguments["faint"]].tolist():
+    if faint := np.flatnonzero(dropped)[: given["faint"]].tolist():
         of[faint], dropped[faint] = np.arange(len(small), len(small) + len(faint)), False
         small = join([small, scene.take(scene.core.order[faint])])
     parents = np.empty(len(scene), np.int32)
     parents[scene.core.order] = of.view(np.int32)  # GONE is −1
-    return _merged(scene, small, parents, out["clamped_opacities"], inputs)
+    return _merged(scene, small, parents, out["clamped_opacities"], given)
 
 
-def reduce(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
+def reduce(given: Given) -> Arrays:
     """Simplify a tile as a scene of its own, by a method that has steps which tiles do not share.
 
     Args:
-        arguments: `tile`; `method`, the fields of its config; `count`, the Gaussians to keep; `final`, those
-            that further rounds keep.
-        inputs: `visibility`.
+        given: `method`, the fields of its config; `count`, the Gaussians to keep; `final`, those that further
+            rounds keep.
 
     Returns:
         What `merge` returns; also `protected`, (n,) bool.
     """
-    scene = tile_of(arguments, inputs, places)
-    config = SimplifyConfig(**arguments["method"])
-    seen = _visibility(inputs)
-    final = arguments["final"]
+    scene = tile_of(given)
+    config = SimplifyConfig(**given["method"])
+    seen = _visibility(given)
+    final = given["final"]
     done = simplify(
-        scene, arguments["count"], config=config, visibility=seen, final_budget=final, progress=telling
+        scene, given["count"], config=config, visibility=seen, final_budget=final, progress=telling
     )
     clamped = done.report.clamped_opacities
-    made = _merged(scene, done.splats, done.parents.astype(np.int32), clamped, inputs)
+    made = _merged(scene, done.splats, done.parents.astype(np.int32), clamped, given)
     return made | {"protected": done.protected}
 
 
 def _merged(
-    scene: PreparedScene, small: Splats, parents: NDArray[np.int32], clamped: int, inputs: Inputs
+    scene: PreparedScene, small: Splats, parents: NDArray[np.int32], clamped: int, given: Given
 ) -> Arrays:
     """Return what `merge` returns; sums do not depend on the order of the tile's rows."""
     of = parents[scene.core.order]
     kept = of >= 0
     made = {**arrays_of(small, "scene"), "parents": parents, "clamped": np.array(clamped)}
     made["members"] = np.bincount(of[kept], minlength=len(small))
-    if (seen := _visibility(inputs)) is not None:
+    if (seen := _visibility(given)) is not None:
         weight = seen.weight[scene.core.order][kept]
         made["wanted"] = np.bincount(of[kept], weight, len(small))
         made["unseen"] = np.array(np.count_nonzero(weight == 0))
     return made
 
 
-def merged_visibility(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
+def merged_visibility(given: Given) -> Arrays:
     """Measure what the same views see of a tile's merged Gaussians.
 
     Args:
-        arguments: `tile`, `levels`, `others`, `others_weight`.
-        inputs: `coarse`, `views`, `visibility`; `merged`, the output of `merge`.
+        given: `others`, `others_weight`, as for `visibility`; `merged`, the output of `merge`.
 
     Returns:
         `weight`, (n,) float32 Σ αT², scaled like those of `visibility`.
     """
-    core = as_prepared(scene_of(inputs["merged"], "scene").with_sh_degree(0))
-    used, share, near = load(inputs["visibility"], "used", "share", "near")
-    cameras = cameras_of(inputs["views"]).recentred(core.offset)
+    core = as_prepared(scene_of(given["merged"], "scene").with_sh_degree(0))
+    used, share, near = load(given["visibility"], "used", "share", "near")
+    cameras = cameras_of(given["cameras"]).recentred(core.offset)
     settings = RasterSettings(antialiased=core.antialiased, near=float(near))
-    amid = with_surroundings(core, arguments, inputs, places)
+    amid = with_surroundings(core, given)
     weight = _sum_of(core, amid, cameras.take(used), settings) / np.float32(share)
-    return {"weight": weight + _of_others(core, amid, cameras, settings, arguments)}
+    return {"weight": weight + _of_others(core, amid, cameras, settings, given)}
 
 
 def _of_others(
-    own: PreparedScene, amid: PreparedScene, cameras: Cameras, settings: RasterSettings, arguments: Arguments
+    own: PreparedScene, amid: PreparedScene, cameras: Cameras, settings: RasterSettings, given: Given
 ) -> NDArray[np.float32]:
     """Return the weighted Σ αT² of a tile's Gaussians over views of other kinds."""
-    weight = np.float32(arguments["others_weight"])
-    return weight * _sum_of(own, amid, cameras.take(arguments["others"]), settings)
+    weight = np.float32(given["others_weight"])
+    return weight * _sum_of(own, amid, cameras.take(given["others"]), settings)
 
 
 def _sum_of(
@@ -336,8 +326,8 @@ def _sum_of(
     return sums.by_row()[0][: len(own)]
 
 
-def _config(arguments: Arguments) -> Pairs:
-    config = SimplifyConfig(**arguments["config"])
+def _config(given: Given) -> Pairs:
+    config = SimplifyConfig(**given["config"])
     assert isinstance(config, Pairs)
     return config
 
@@ -349,15 +339,15 @@ def _merging(
     return _core.TileMerging(scene.core, frame, config, seen)
 
 
-def _seen_tile(scene: PreparedScene, arguments: Arguments, inputs: Inputs) -> _core.TileMerging:
-    frame = _core.TileFrame(*arguments["frame"])
-    return _merging(scene, _config(arguments), frame, _visibility(inputs))
+def _seen_tile(scene: PreparedScene, given: Given) -> _core.TileMerging:
+    frame = _core.TileFrame(*given["frame"])
+    return _merging(scene, _config(given), frame, _visibility(given))
 
 
-def _visibility(inputs: Inputs) -> SampledVisibility | None:
-    if "visibility" not in inputs:
+def _visibility(given: Given) -> SampledVisibility | None:
+    if "visibility" not in given:
         return None
-    return SampledVisibility(*load(inputs["visibility"], "weight", "pixel_size"))
+    return SampledVisibility(*load(given["visibility"], "weight", "pixel_size"))
 
 
 def _widened(scene: Splats, times: int) -> Splats:
@@ -385,47 +375,25 @@ class TiledRun:
         self.store = store
         self.workers = workers
         workers.folder.mkdir(parents=True, exist_ok=True)
-        model = store.render_model
         self.method = config
         merging = config if isinstance(config, Pairs) else config.turned("default")
         assert isinstance(merging, Pairs)
         self.merging = merging
-        self.config = asdict(self.merging.resolved(antialiased=model == "antialiased"))
+        self.config = asdict(merging.resolved(antialiased=store.render_model == "antialiased"))
         self.sizes = [tile.rows for tile in store.tiles]
-        self.coarse: list[Path] = []
-        sampled = [{"sampled": sample_stride(store.count)}] * len(self.sizes)
-        self.coarse = self.each("coarse", "coarse", per_tile=sampled)
+        self._common: list[dict[str, Any]] = [
+            {"content": store.key, "tile": tile, "config": self.config} for tile in range(len(self.sizes))
+        ]
+        sampled = {"sampled": sample_stride(store.count)}
+        self.coarse = self.each(coarse, "coarse", [sampled] * len(self.sizes))
+        for common, path in zip(self._common, self.coarse, strict=True):
+            common["own"] = path
 
-    def each(
-        self,
-        function: str,
-        stage: str,
-        *,
-        frame: tuple[float, ...] | None = None,
-        per_tile: list[dict[str, Any]] | None = None,
-        inputs: list[dict[str, Any]] | None = None,
-        module: str = __name__,
-    ) -> list[Path]:
-        """Run one task per tile; each reads the tile's `coarse` output if there is one."""
-        tasks = []
-        for tile, rows in enumerate(self.sizes):
-            own = {"own": self.coarse[tile]} if self.coarse else {}
-            arguments: dict[str, Any] = {"store": self.store.key, "tile": tile, "config": self.config}
-            if frame is not None:
-                arguments["frame"] = list(frame)
-            arguments |= per_tile[tile] if per_tile else {}
-            tasks.append(
-                Task(
-                    f"{module}:{function}",
-                    f"{stage}-{tile:05}",
-                    self.workers.folder,
-                    arguments,
-                    {**own, **(inputs[tile] if inputs else {})},
-                    {"store": self.store.folder},
-                    rows,
-                )
-            )
-        return self.workers.run(tasks, stage)
+    def each(self, function: Callable[[Given], Arrays], stage: str, per_tile: Iterable[Given]) -> list[Path]:
+        """Run a function for each tile; `per_tile` is what it gets besides what belongs to the tile."""
+        given = ({**common, **own} for common, own in zip(self._common, per_tile, strict=True))
+        calls = zip(given, self.sizes, strict=True)
+        return self.workers.map(function, stage, calls, {"store": self.store.folder})
 
     @property
     def has_own_steps(self) -> bool:

@@ -30,10 +30,8 @@ from g2ard.system.keys import UNKEYED, key_of
 Arrays = dict[str, NDArray[Any]]
 """Output of a task: arrays by name, stored as one .npz file."""
 
-Arguments = Mapping[str, Any]
-Inputs = Mapping[str, Any]
-Places = Mapping[str, Any]
-"""Parameters of a task's function, see `Task`."""
+Given = Mapping[str, Any]
+"""Parameter of a task's function: what is given to it, by name, see `Task`."""
 
 _SCENE_ARRAYS = ("means", "quats", "scales", "logit_opacities", "sh0", "shN", "offset", "render_model")
 
@@ -59,33 +57,27 @@ _CORRUPT_FILE_ERRORS = (zipfile.BadZipFile, zlib.error, ValueError, EOFError, Lo
 class Task:
     """A function call whose result is kept in a file.
 
-    The file's name contains a hash of the function, its arguments and the names of its input files, which
-    contain hashes in turn. An existing file is therefore always up to date.
+    The file's name contains a hash of the function, what is given to it and the names of its input files,
+    which contain hashes in turn. An existing file is therefore always up to date.
 
     Args:
-        function: "module:name" of a function (arguments, inputs, places) → arrays.
-        arguments: JSON values.
-        inputs: output files of other tasks, by name.
-        places: files, folders and streams whose content `arguments` determine; they may be moved.
+        function: "module:name" of a function (given and places) → arrays.
+        given: JSON values, and output files of other tasks, by name.
+        places: files, folders and streams whose content `given` determines; they may be moved.
         cost: amount of work in any common unit, for progress.
     """
 
     function: str
     label: str = field(metadata=UNKEYED)
     folder: Path = field(metadata=UNKEYED)
-    arguments: Mapping[str, Any] = field(default_factory=dict)
-    inputs: Mapping[str, Path | list[Path]] = field(default_factory=dict)
-    places: Places = field(default_factory=dict, metadata=UNKEYED)
+    given: Given = field(default_factory=dict)
+    places: Given = field(default_factory=dict, metadata=UNKEYED)
     cost: int = field(default=1, metadata=UNKEYED)
 
     def absolute(self) -> Task:
         """Return the task for a process that may run in another folder."""
-        inputs = {
-            name: [path.absolute() for path in value] if isinstance(value, list) else value.absolute()
-            for name, value in self.inputs.items()
-        }
-        places = {name: path.absolute() for name, path in self.places.items()}
-        return replace(self, folder=self.folder.absolute(), inputs=inputs, places=places)
+        own = {name: _absolute(getattr(self, name)) for name in ("folder", "given", "places")}
+        return replace(self, **own)
 
     @property
     def key(self) -> str:
@@ -114,6 +106,14 @@ class Task:
         return 0.0
 
 
+def _absolute(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {name: _absolute(one) for name, one in value.items()}
+    if isinstance(value, list):
+        return [_absolute(one) for one in value]
+    return value.absolute() if hasattr(value, "absolute") else value
+
+
 def tell_share(share: float) -> None:
     """Tell how much of the running task is finished, from 0 to 1."""
     _TELL.get()(share)
@@ -136,7 +136,7 @@ def run_task(task: Task, tell: Callable[[float], None] | None = None) -> Path:
     module, name = task.function.split(":")
     before = _TELL.set(tell or _share_writer(task.share_file))
     try:
-        arrays: Arrays = getattr(import_module(module), name)(task.arguments, task.inputs, task.places)
+        arrays: Arrays = getattr(import_module(module), name)({**task.given, **task.places})
     finally:
         _TELL.reset(before)
         task.share_file.unlink(missing_ok=True)
@@ -195,28 +195,29 @@ def cameras_of(path: Path) -> Cameras:
     return Cameras(viewmats, Ks, widths, heights, tuple(str(i) for i in range(len(viewmats))))
 
 
-def tile_of(arguments: Arguments, inputs: Inputs, places: Places, *, sh: bool = True) -> PreparedScene:
+def tile_of(given: Given, *, sh: bool = True) -> PreparedScene:
     """Read a tile's Gaussians with all SH bands or band 0, in the order that the first step stored."""
-    known = inputs.get("own")
-    scene = TileStore.open(places["store"]).read(arguments["tile"], sh=sh)
+    scene = TileStore.open(given["store"]).read(given["tile"], sh=sh)
     prepared = finite_rows_of(scene)[0]
-    if known is not None:
-        prepared.restore(*load(known, "order", "bounds"))
+    if "own" in given:
+        prepared.restore(*load(given["own"], "order", "bounds"))
     return prepared
 
 
-def with_surroundings(core: Splats, arguments: Arguments, inputs: Inputs, places: Places) -> PreparedScene:
+def with_surroundings(core: Splats, given: Given) -> PreparedScene:
     """Join a tile's Gaussians with its halo and the coarse Gaussians of all other tiles beyond the halo."""
-    store = TileStore.open(places["store"])
-    around = [store.read_halo(arguments["tile"], sh=False), *far_around(store, arguments, inputs)]
+    store = TileStore.open(given["store"])
+    around = [store.read_halo(given["tile"], sh=False), *far_around(store, given)]
     return as_prepared(join([part.with_sh_degree(0) for part in [core, *around] if len(part)]))
 
 
-def far_around(store: TileStore, arguments: Arguments, inputs: Inputs) -> list[Splats]:
+def far_around(store: TileStore, given: Given) -> list[Splats]:
     """Return coarse Gaussians of all other tiles beyond the reach of a tile's halo."""
-    own, parts = store.tiles[arguments["tile"]], []
-    low, high = np.array(own.low) - store.margin, np.array(own.high) + store.margin
-    for path, level in zip(inputs["coarse"], arguments["levels"], strict=True):
+    own = store.tiles[given["tile"]]
+    parts = []
+    low = np.array(own.low) - store.margin
+    high = np.array(own.high) + store.margin
+    for path, level in zip(given["coarse"], given["levels"], strict=True):
         if level:
             other = scene_of(path, level)
             within = ((other.means >= low) & (other.means <= high)).all(axis=1)

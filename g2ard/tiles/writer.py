@@ -12,8 +12,8 @@ import pickle
 import re
 import shutil
 import zlib
-from collections.abc import Sequence
-from dataclasses import asdict, replace
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +33,7 @@ from g2ard.stages.lift import LiftConfig, lift_rows
 from g2ard.system.cached import cached_property
 from g2ard.system.keys import key_of
 from g2ard.tiles.executor import Executor, Workers, run_here
-from g2ard.tiles.tasks import Arguments, Arrays, Inputs, Places, Task, is_whole, load, save, telling
+from g2ard.tiles.tasks import Arrays, Given, is_whole, load, save, telling
 
 _TREE_SAMPLE = 1 << 20
 """Size of the sample of positions that determines the tiles (12 MB)."""
@@ -86,6 +86,7 @@ def _read_begun(parts: Path) -> dict[str, Any]:
     return dict(read_json(parts / MANIFEST)) if (parts / MANIFEST).is_file() else {}
 
 
+@dataclass(eq=False)
 class Pouring:
     """The tiles of a stream while they are written; the manifest comes last.
 
@@ -97,33 +98,24 @@ class Pouring:
         mended: complete tiles, and those of them to write again; None writes all.
     """
 
-    def __init__(
-        self,
-        folder: Path,
-        stream: Stream,
-        key: str,
-        *,
-        tile_rows: int,
-        rows: int | None,
-        runs: Executor,
-        mended: tuple[TileStore, list[int]] | None,
-        progress: Progress,
-        say: Say,
-    ) -> None:
-        self.folder = folder
-        self.parts = folder / PARTS
-        self.stream = stream
-        self.key = key
-        self.tile_rows = tile_rows
-        self.mended = mended
-        self.say = say
-        self.rows = rows or max(1, _PART_BYTES // row_bytes(stream))
+    folder: Path
+    stream: Stream
+    key: str
+    tile_rows: int
+    rows: int | None
+    runs: Executor
+    mended: tuple[TileStore, list[int]] | None
+    progress: Progress
+    say: Say
+
+    def __post_init__(self) -> None:
+        self.parts = self.folder / PARTS
         self.parts.mkdir(exist_ok=True)
-        self.workers = Workers(runs, self.parts, progress)
-        here = runs is run_here or not _can_be_sent(stream)
+        self.workers = Workers(self.runs, self.parts, self.progress)
+        here = self.runs is run_here or not _can_be_sent(self.stream)
         self.readers = replace(self.workers, executor=run_here) if here else self.workers
-        if _read_begun(self.parts).get("key") != key:
-            self._begin({"key": key})
+        if _read_begun(self.parts).get("key") != self.key:
+            self._begin({"key": self.key})
 
     def _begin(self, known: dict[str, Any]) -> None:
         with atomic_output(self.parts / MANIFEST, overwrite=True) as temporary:
@@ -136,7 +128,7 @@ class Pouring:
         if tree is None or not is_whole(tree):
             tree = self._plan()
         while True:
-            files = self._run_parts("cut", "tiles", {"only": self._near}, {"tree": tree})
+            files = self._run_parts(cut, "tiles", {"only": self._near, "tree": tree})
             self._tell_counts(files)
             parts = self._cut_again(files)
             if not parts:
@@ -147,23 +139,14 @@ class Pouring:
             for path in files:
                 path.unlink()
 
-    def _run_parts(
-        self, function: str, stage: str, arguments: dict[str, Any], inputs: dict[str, Path]
-    ) -> list[Path]:
+    def _run_parts(self, function: Callable[[Given], Arrays], stage: str, given: Given) -> list[Path]:
         """Run a function that reads the stream on each part."""
-        tasks = [
-            Task(
-                f"{__name__}:{function}",
-                f"{function}-{number:05}",
-                self.parts,
-                {"key": self.key, "part": [self.rows, first, last], **arguments},
-                inputs,
-                {"stream": self.stream},
-                last - first,
-            )
-            for number, (first, last) in enumerate(self.stream.parts(self.rows))
+        rows = self.rows or max(1, _PART_BYTES // row_bytes(self.stream))
+        calls = [
+            ({"key": self.key, "part": [rows, first, last], **given}, last - first)
+            for first, last in self.stream.parts(rows)
         ]
-        return self.readers.run(tasks, stage)
+        return self.readers.map(function, stage, calls, {"stream": self.stream})
 
     @cached_property
     def _near(self) -> list[int] | None:
@@ -199,8 +182,9 @@ class Pouring:
 
     def _sample(self) -> tuple[Float32, float]:
         """Return a sample of positions, and the rows that each stands for."""
-        files = self._run_parts("sample", "sample", {"count": self.stream.count, "size": _TREE_SAMPLE}, {})
-        sampler = Sampler(self.stream.count, _TREE_SAMPLE)
+        size = {"count": self.stream.count, "size": _TREE_SAMPLE}
+        files = self._run_parts(sample, "sample", size)
+        sampler = Sampler(**size)
         sampler.limit = min([sampler.limit, *(int(load(path, "limit")[0]) for path in files)])
         for path in files:
             sampler.add(load(path, "points")[0])
@@ -237,43 +221,38 @@ class Pouring:
 
     def lift(self, tree: Path, files: Sequence[Path], config: LiftConfig) -> list[Path]:
         """Lift the points of each tile with its halo; return the files of the tiles."""
-        arguments = {"config": asdict(config), "only": self._near}
-        return self._run_each("lifted", "lift", self._near, files, arguments, {"tree": tree}, {})
+        given = {"config": asdict(config), "only": self._near, "tree": tree}
+        return self._run_each(lifted, "lift", self._near, files, given)
 
     def _run_each(
         self,
-        function: str,
+        function: Callable[[Given], Arrays],
         stage: str,
         tiles: list[int] | None,
         files: Sequence[Path],
-        arguments: dict[str, Any],
-        inputs: dict[str, Any],
-        places: dict[str, Path],
+        given: Given,
     ) -> list[Path]:
         """Run a function for tiles, None for all; it gets the files that have rows of a tile or its halo."""
         counts = _count_rows(files)
-        tasks = [
-            Task(
-                f"{__name__}:{function}",
-                f"{function}-{tile:05}",
-                self.parts,
-                {"key": self.key, "tile": tile, **arguments},
+        calls = [
+            (
                 {
+                    "key": self.key,
+                    "tile": tile,
                     "core": _select(files, counts[:, tile, 0]),
                     "halo": _select(files, counts[:, tile, 1]),
-                    **inputs,
+                    **given,
                 },
-                places,
                 int(counts[:, tile, 0].sum()),
             )
             for tile in (range(counts.shape[1]) if tiles is None else tiles)
         ]
-        return self.workers.run(tasks, stage)
+        return self.workers.map(function, stage, calls, {"folder": self.folder})
 
     def gather(self, tree: Path, files: Sequence[Path]) -> list[dict[str, Any]]:
         """Write the rows of each tile and of its halo; return the manifest's entries."""
         some = None if self.mended is None else self.mended[1]
-        written = self._run_each("gathered", "write", some, files, {}, {}, {"folder": self.folder})
+        written = self._run_each(gathered, "write", some, files, {})
         bounds = np.array([load(path, "bounds")[0] for path in written])
         low = bounds[:, 0].min(axis=0)
         high = bounds[:, 1].max(axis=0)
@@ -355,36 +334,33 @@ def _load_rows(files: Sequence[Path], name: str) -> NDArray[Any]:
     return np.concatenate([load(path, name)[0] for path in files])
 
 
-def sample(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
+def sample(given: Given) -> Arrays:
     """Sample the positions of a part.
 
     Args:
-        arguments: `part`, see `Stream.part`; `count` and `size`, of the `Sampler`.
-        places: `stream`.
+        given: `stream`; `part`, see `Stream.part`; `count` and `size`, of the `Sampler`.
 
     Returns:
         `points`, (n, 3), and the `limit` of their hashes.
     """
-    sampler = Sampler(arguments["count"], arguments["size"])
-    for points in places["stream"].part("positions", *arguments["part"]):
+    sampler = Sampler(given["count"], given["size"])
+    for points in given["stream"].part("positions", *given["part"]):
         sampler.add(points)
     return {"points": sampler.result()[0], "limit": np.array(sampler.limit)}
 
 
-def cut(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
+def cut(given: Given) -> Arrays:
     """Cut a part into tiles.
 
     Args:
-        arguments: `part`, see `Stream.part`; `only`, the tiles to cut, None for all.
-        inputs: `tree`.
-        places: `stream`.
+        given: `stream`; `part`, see `Stream.part`; `tree`; `only`, the tiles to cut, None for all.
 
     Returns:
         What `_route` returns; `tallies`, the counts of each source.
     """
-    stream = places["stream"]
+    stream = given["stream"]
     blocks = list[NDArray[Any]]()
-    for block in stream.part("blocks", *arguments["part"]):
+    for block in stream.part("blocks", *given["part"]):
         if isinstance(stream, PointStream):
             far, colors = block
             points = np.empty(len(far), _POINT_DTYPE)
@@ -394,15 +370,16 @@ def cut(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
             blocks.append(packed(block))
     rows = blocks[0] if len(blocks) == 1 else np.concatenate(blocks)
     tallies = np.array([tally.counts() for tally in stream.tallies()])
-    return {**_route(rows, inputs["tree"], arguments["only"]), "tallies": tallies}
+    return {**_route(rows, given), "tallies": tallies}
 
 
-def _route(rows: NDArray[Any], file: Path, only: Sequence[int] | None) -> Arrays:
+def _route(rows: NDArray[Any], given: Given) -> Arrays:
     """Return the rows of each tile and of its halo, called by the names of its files, if there are any.
 
     `counts`, (tiles, 2), has their numbers.
     """
-    tree, margin = _load_tree(file)
+    tree, margin = _load_tree(given["tree"])
+    only = given["only"]
     made = Arrays()
     counts = np.zeros((tree.leaves, 2), np.int64)
     for tile, chosen in enumerate(tree.route(_get_positions(rows), margin)):
@@ -415,48 +392,47 @@ def _route(rows: NDArray[Any], file: Path, only: Sequence[int] | None) -> Arrays
     return {**made, "counts": counts}
 
 
-def lifted(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
+def lifted(given: Given) -> Arrays:
     """Lift a tile's points with those of its halo as neighbours.
 
     Args:
-        arguments: `tile`; `config`, the fields of `LiftConfig`; `only`, see `cut`.
-        inputs: `core`, `halo`, the files of `cut` that have points of the tile and of its halo; `tree`.
+        given: `tile`; `config`, the fields of `LiftConfig`; `tree`, `only`, see `cut`; `core`, `halo`, the
+            files of `cut` that have points of the tile and of its halo.
 
     Returns:
         What `_route` returns of the discs.
     """
-    if not inputs["core"]:
-        return _route(np.empty((0, row_width(0)), "<f4"), inputs["tree"], arguments["only"])
-    core = _load_rows(inputs["core"], tile_name(arguments["tile"]))
-    halo = [load(path, halo_name(arguments["tile"]))[0] for path in inputs["halo"]]
+    if not given["core"]:
+        return _route(np.empty((0, row_width(0)), "<f4"), given)
+    core = _load_rows(given["core"], tile_name(given["tile"]))
+    halo = [load(path, halo_name(given["tile"]))[0] for path in given["halo"]]
     both = np.concatenate([core, *halo])
-    discs, rows = lift_rows(both["far"], both["rgb"], LiftConfig(**arguments["config"]), telling)
+    discs, rows = lift_rows(both["far"], both["rgb"], LiftConfig(**given["config"]), telling)
     rows = rows[rows < len(core)]
     means = np.ascontiguousarray(core["near"][rows])
     kept = replace(discs.take(slice(0, len(rows))), means=means)
-    return _route(packed(kept), inputs["tree"], arguments["only"])
+    return _route(packed(kept), given)
 
 
-def gathered(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
+def gathered(given: Given) -> Arrays:
     """Write the files of a tile.
 
     Args:
-        arguments: `tile`.
-        inputs: `core`, `halo`, the files that have rows of the tile and of its halo, in their order.
-        places: `folder`, of the tiles.
+        given: `folder`, of the tiles; `tile`; `core`, `halo`, the files that have rows of the tile and of its
+            halo, in their order.
 
     Returns:
         `rows` and `checks` (CRC-32) of both files; `bounds`, (2, 3) of the tile's positions.
     """
-    tile = arguments["tile"]
-    folder = places["folder"]
+    tile = given["tile"]
+    folder = given["folder"]
     counts = [0, 0]
     checks = [0, 0]
     low = np.full(3, np.inf)
     high = np.full(3, -np.inf)
     for kind, (which, name) in enumerate((("core", tile_name(tile)), ("halo", halo_name(tile)))):
         with atomic_output(folder / PARTS / name, overwrite=True) as temporary, temporary.open("wb") as file:
-            for path in inputs[which]:
+            for path in given[which]:
                 (rows,) = load(path, name)
                 file.write(data := np.ascontiguousarray(rows).view(np.uint8).data)
                 checks[kind] = zlib.crc32(data, checks[kind])

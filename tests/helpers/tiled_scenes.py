@@ -15,7 +15,7 @@ from g2ard.stages.simplify import SimplifyConfig
 from g2ard.tiles.executor import Workers, executor
 from g2ard.tiles.merging import simplify_tiles
 from g2ard.tiles.simplify import TiledRun
-from g2ard.tiles.tasks import Arguments, Arrays, Inputs, Places, tell_share
+from g2ard.tiles.tasks import Arrays, Given, tell_share
 
 
 def town(count: int = 9000, seed: int = 0) -> Splats:
@@ -72,7 +72,7 @@ def reduced(
         return simplify_tiles(run, budget, views).splats.whole()
 
 
-def half_told(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
+def half_told(given: Given) -> Arrays:
     """Tell that half is done, long enough for the process that waits."""
     tell_share(0.5)
     time.sleep(1.0)

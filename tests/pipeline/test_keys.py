@@ -59,7 +59,7 @@ KEYED: dict[type, tuple[Any, str]] = {
     Splats: (BALL, "up axes"),
     Cameras: (VIEWS, "image_paths mask_paths source"),
     Task: (
-        Task("a:b", "label", Path("work"), {"tile": 1, "levels": ["near"]}, {"own": Path("a.npz")}),
+        Task("a:b", "label", Path("work"), {"tile": 1, "levels": ["near"], "own": Path("a.npz")}),
         "label folder places cost",
     ),
     Loop: (

@@ -337,7 +337,7 @@ def test_coarse_surroundings_begin_where_the_halo_ends(store: TileStore, tmp_pat
     everything = [scene_of(path, "near").means for path in coarse]
     for tile in store.tiles:
         levels = [None if other is tile else "near" for other in store.tiles]
-        far = far_around(store, {"tile": tile.index, "levels": levels}, {"coarse": coarse})
+        far = far_around(store, {"tile": tile.index, "levels": levels, "coarse": coarse})
         found = np.concatenate([part.means for part in far])
         others = np.concatenate([part for part, level in zip(everything, levels, strict=True) if level])
         # How far each lies outside the tile, along the axis where it is farthest.
