@@ -23,9 +23,9 @@ from g2ard.jobs.chosen_points import PointChoice
 from g2ard.jobs.clean import remove_clutter
 from g2ard.jobs.distill_job import DistillJob
 from g2ard.jobs.distill_options import DistillOptions
-from g2ard.jobs.inputs import GivenViews, Views, split_views
+from g2ard.jobs.inputs import Views, split_views
 from g2ard.jobs.memory import RECOVERY_TIMES
-from g2ard.jobs.run_views import Use, choose_views, find_pool_growth
+from g2ard.jobs.run_views import choose_views, find_pool_growth
 from g2ard.jobs.scoring import add_scores
 from g2ard.jobs.simplify import Reduction
 from g2ard.jobs.start import Given, Start, describe_tiled_start, read_start
@@ -181,10 +181,12 @@ def distill(
         preset=preset,
         time=time,
         settings=changed | dict(settings or {}),
+        progress=progress,
+        say=say,
     )
     source = Source(scene, render_model) if isinstance(scene, str | Path) else scene
     PointChoice(box, where, color).narrow(source, progress)
-    job = prepare(source, budget, options, progress=progress, say=say)
+    job = prepare(source, budget, options)
     done = job.run(work)
     if judgement := job.budget.judge(done.splats):
         say(judgement[1])
@@ -197,22 +199,14 @@ def open_job(
     budget: Budget | None,
     options: DistillOptions,
     tiling: Tiling | None = None,
-    *,
-    use: Use = "distil",
-    planned: bool = False,
-    progress: Progress = silent,
-    say: Say = unsaid,
 ) -> Iterator[DistillJob]:
     """Prepare a distillation of a scene in memory, or in tiles.
 
     Args:
         tiling: how to process the scene, a file, in tiles; None reads it into memory.
-        planned: whether this is a dry run: the job has a cost, but cannot run. Views are stand-ins, and tiles
-            are only planned.
     """
-    callbacks: dict[str, Any] = {"progress": progress, "say": say}
     if tiling is None:
-        yield prepare(scene, budget, options, use=use, planned=planned, **callbacks)
+        yield prepare(scene, budget, options)
         return
     from g2ard.jobs.dense import open_tiles
 
@@ -224,15 +218,21 @@ def open_job(
     source = scene.drawn_as(options.render_model)
     split = None
     if scene.kind == "points" and options.photo_views is not None:
-        split = split_views(options.photo_views, options.held_out, say)
+        split = split_views(options.photo_views, options.held_out, options.say)
         if not scene.others and is_sparse_file(scene, options.photo_views):
             source = keep_seen_points(scene, split[0].cameras)
-        source = colored_source(source, split[0].cameras, planned=planned)
+        source = colored_source(source, split[0].cameras, planned=options.planned)
     with open_tiles(
-        source, tiling, RECOVERY_TIMES, config.simplify, config.lift, planned=planned, **callbacks
+        source,
+        tiling,
+        RECOVERY_TIMES,
+        config.simplify,
+        config.lift,
+        planned=options.planned,
+        progress=options.progress,
+        say=options.say,
     ) as tiles:
-        given = replace(tiles, views=split)
-        yield prepare(scene, budget, options, given, use=use, planned=planned, began=began, **callbacks)
+        yield prepare(scene, budget, options, replace(tiles, views=split), began)
 
 
 def prepare(
@@ -240,12 +240,7 @@ def prepare(
     budget: Budget | None,
     options: DistillOptions,
     tiles: Opened | None = None,
-    *,
-    use: Use = "distil",
-    planned: bool = False,
     began: float | None = None,
-    progress: Progress = silent,
-    say: Say = unsaid,
 ) -> DistillJob:
     """Read inputs and decide everything that a distillation needs.
 
@@ -255,24 +250,24 @@ def prepare(
     Args:
         budget: None chooses a count for photos alone.
         tiles: the scene, if it is in tiles.
-        planned: see `open_job`.
         began: when the preparation began; None means now.
     """
     began = began or time.monotonic()
-    recovers = use != "merging"
+    say = options.say
+    recovers = options.recovers
     seed = options.config.recover.seed  # rejects invalid settings before anything is read
     if tiles is None:
-        start = read_start(scene, budget, options, progress, say, planned=planned)
+        start = read_start(scene, budget, options)
     else:
         assert isinstance(scene, Source)
-        start = describe_tiled_start(scene, options, tiles, say)
+        start = describe_tiled_start(scene, options, tiles)
     budget = budget or Budget(count=start.usual)
     dense = start.dense
     cleaned = None
-    if options.clean and planned:
+    if options.clean and options.planned:
         say("--clean: only the run finds what to remove; counts are of the whole scene")
     elif options.clean:
-        dense, cleaned = remove_clutter(dense, seed=seed, progress=progress, say=say)
+        dense, cleaned = remove_clutter(dense, seed=seed, progress=options.progress, say=say)
     usual = max(1, dense.total // _USUAL_RATIO)
     views = choose_views(
         dense,
@@ -281,10 +276,6 @@ def prepare(
         given=start.views,
         beside=start.beside,
         teach=not start.needs_photos and options.photos is not True,
-        use=use,
-        rough=planned,
-        progress=progress,
-        say=say,
     )
     cameras = views.train.cameras
     plan = None if tiles is None else tiles.plan
@@ -292,18 +283,16 @@ def prepare(
         dense,
         cameras=cameras,
         blind=options.config.simplify.method == "paper",
-        given=GivenViews(seed=seed, rough=planned),
+        given=replace(options.request_views(None), views=None),
         config=options.config.simplify,
         recovered=recovers,
         plan=plan,
-        progress=progress,
-        say=say,
     )
     sh_degree = 3 if start.needs_photos else None  # points have one colour each, photos show more
     degree = options.configure(sh_degree=sh_degree).recover.sh_degree
     wanted = reduce.resolve(budget, start.name, f"scene.{options.format}", degree)
-    teaching = _choose_teaching(options, start, dense, views, planned=planned, say=say)
-    measured_in = cameras if teaching.photos and not planned else None
+    teaching = _choose_teaching(options, start, dense, views)
+    measured_in = cameras if teaching.photos and not options.planned else None
     regularizers, why, measures = _choose_regularizers(options, start, dense.sample, measured_in)
     teaching.propose_background(cameras)
     if start.given:
@@ -342,7 +331,7 @@ def prepare(
         began=began,
         prepared=time.monotonic(),
         time=options.time,
-        progress=progress,
+        progress=options.progress,
         say=say,
         plan=plan,
     )
@@ -366,9 +355,7 @@ def _grow_steps(recover: RecoverConfig, dense: Dense, cameras: Cameras, *, of_ph
     return replace(recover, steps=round(needed * times))
 
 
-def _choose_teaching(
-    options: DistillOptions, start: Start, dense: Dense, views: RunViews, *, planned: bool, say: Say
-) -> Teaching:
+def _choose_teaching(options: DistillOptions, start: Start, dense: Dense, views: RunViews) -> Teaching:
     """Decide whether photos are targets, and whether renders of the dense scene are, at least elsewhere."""
     names = (*views.train.cameras.names, *views.test.names)
     paths = (*views.train.cameras.image_paths, *views.test.image_paths)
@@ -390,8 +377,8 @@ def _choose_teaching(
         background,
         chosen=options.find("recover.background") is not None,
         insisted=options.photos is True,
-        rough=planned,
-        say=say,
+        rough=options.planned,
+        say=options.say,
         limit=limit,
     )
 

@@ -5,15 +5,16 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from g2ard.config.checks import AtLeastOne, Positive
 from g2ard.config.choices import Focus, FormatName, RenderModel, is_made
 from g2ard.config.schema import Settings, full_paths, values_of
 from g2ard.errors import InputError
-from g2ard.jobs.inputs import Views
+from g2ard.jobs.inputs import GivenViews, Views
 from g2ard.pipeline.config import DistillConfig
 from g2ard.pipeline.presets import PRESETS, configure
+from g2ard.progress import Progress, Say, silent, unsaid
 from g2ard.rendering.targets import CACHE_BYTES
 from g2ard.stages.lift import LiftConfig
 from g2ard.stages.recover.anchors import Regularizers
@@ -37,6 +38,9 @@ class DistillOptions(Settings):
         time: seconds that the whole run may take; recovery gets what the rest leaves.
         memory: bytes that the run may take; None is no limit.
         settings: values of `DistillConfig` by path, which override the preset.
+        use: what the scene is prepared for. Levels are scored in usual views alone; merging has no recovery.
+        planned: whether this is for a dry run: the job has a cost, but cannot run. Views are stand-ins, and
+            tiles are only planned.
 
     Others are those of `g2ard.distill`.
 
@@ -57,6 +61,10 @@ class DistillOptions(Settings):
     time: Positive | None = None
     memory: AtLeastOne | None = None
     settings: Mapping[str, Any] = field(default_factory=dict)
+    use: Literal["distil", "levels", "merging"] = "distil"
+    planned: bool = False
+    progress: Progress = silent
+    say: Say = unsaid
 
     @cached_property
     def config(self) -> DistillConfig:
@@ -79,6 +87,23 @@ class DistillOptions(Settings):
     def photo_views(self) -> Views | None:
         """Given views whose photos a point cloud learns from."""
         return None if is_made(self.views) or self.photos is False else self.views
+
+    @property
+    def recovers(self) -> bool:
+        """Whether the scene is recovered after it is merged."""
+        return self.use != "merging"
+
+    def request_views(self, beside: str | Path | None) -> GivenViews:
+        """Return the views as they are requested, with a path that they may be beside."""
+        return GivenViews(
+            self.views,
+            beside,
+            self.up,
+            self.config.recover.seed,
+            rough=self.planned,
+            progress=self.progress,
+            say=self.say,
+        )
 
     def configure(
         self, regularizers: Regularizers | None = None, sh_degree: int | None = None

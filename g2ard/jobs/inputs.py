@@ -48,6 +48,8 @@ class GivenViews:
         seed: seed of generated views.
         shape: width and height of generated views in pixels.
         rough: whether stand-ins of generated views do, as for a dry run: nothing is rendered for them.
+        progress: called while views are generated.
+        say: called with what was found or generated.
     """
 
     views: Views | None = None
@@ -56,6 +58,8 @@ class GivenViews:
     seed: int = 0
     shape: tuple[int, int] = (800, 600)
     rough: bool = False
+    progress: Progress = silent
+    say: Say = unsaid
 
 
 def load_scene(

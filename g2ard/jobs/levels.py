@@ -210,8 +210,6 @@ def open_levels(
     background: Colour,
     split_sky: bool,
     seed: int,
-    planned: bool = False,
-    progress: Progress = silent,
     say: Say = unsaid,
     **inputs: Any,
 ) -> Iterator[LevelsJob]:
@@ -219,7 +217,7 @@ def open_levels(
 
     Args:
         tiling: how to process the scene in tiles; None for one piece.
-        planned: whether tiles are only planned.
+        inputs: other fields of `DistillOptions`.
     """
     check_ratios(ratios)
     sky = None
@@ -237,16 +235,9 @@ def open_levels(
     settings = {"recover.background": background, "recover.seed": seed}
     settings |= {} if steps is None else {"recover.steps": steps}
     inputs.setdefault("photos", False)
-    with open_job(
-        scene,
-        Budget(ratio=ratios[-1]),
-        DistillOptions(settings=settings, **inputs),
-        tiling,
-        use="levels" if recover else "merging",
-        planned=planned,
-        progress=progress,
-        say=say,
-    ) as job:
+    use: Any = "levels" if recover else "merging"
+    options = DistillOptions(settings=settings, use=use, say=say, **inputs)
+    with open_job(scene, Budget(ratio=ratios[-1]), options, tiling) as job:
         yield LevelsJob(job, ratios, sky)
 
 

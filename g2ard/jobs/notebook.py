@@ -98,7 +98,7 @@ def view(
     ]
     beside = shown[0].file if isinstance(shown[0], Source) else None
     labels = label_scenes(named, [len(splats) for splats in loaded])
-    stand = choose_frame(loaded[0], GivenViews(views, beside, up), start=start, say=say)
+    stand = choose_frame(loaded[0], GivenViews(views, beside, up, say=say), start)
     page = Path(mkdtemp(prefix="g2ard-")) / "view.html" if output is None else Path(output)
     write_page(
         page,

@@ -282,8 +282,8 @@ def prepare(
     )
     if dense is not None:
         beside = None if isinstance(teacher, Splats) else teacher
-        asked = GivenViews(views, beside, seed=config.seed, rough=rough)
-        views = find_or_plan_views(dense, asked, student=start, progress=progress, say=say)
+        asked = GivenViews(views, beside, seed=config.seed, rough=rough, progress=progress, say=say)
+        views = find_or_plan_views(dense, asked, student=start)
     assert views is not None  # `check_teacher`
     read = read_views(teaching, start, views, split, size)
     if not config.schedule.guarded:

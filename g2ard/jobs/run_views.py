@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,7 +31,7 @@ from g2ard.pipeline.dense import Dense, InMemory
 from g2ard.pipeline.distill import RunViews, choose_draw_weights
 from g2ard.poses import Pool, best_views, plan_pool, turntable
 from g2ard.poses.zooms import zoomed
-from g2ard.progress import Progress, Say, direction, plural, silent, unsaid
+from g2ard.progress import Progress, Say, direction, plural, unsaid
 from g2ard.scene.cameras import USUAL, Camera, Cameras, rows_by_kind
 from g2ard.scene.samples import evenly_spaced, take_evenly
 from g2ard.scene.splats import Splats
@@ -41,8 +41,6 @@ from g2ard.stages.simplify import simplify
 
 if TYPE_CHECKING:
     from g2ard.jobs.distill_options import DistillOptions
-Use = Literal["distil", "levels", "merging"]
-"""Use of generated views. Levels are scored in usual views alone; merging has no recovery."""
 
 _SHAPE = (800, 600)
 """Width and height of generated views in pixels, unless another size is requested."""
@@ -109,10 +107,6 @@ def choose_views(
     given: tuple[ViewSet, Cameras] | None = None,
     beside: str | Path | None = None,
     teach: bool = True,
-    use: Use = "distil",
-    rough: bool = False,
-    progress: Progress = silent,
-    say: Say = unsaid,
 ) -> RunViews:
     """Choose views for recovery and for scoring.
 
@@ -128,24 +122,14 @@ def choose_views(
         beside: path beside which to look for cameras.
         teach: whether the scene can render targets; otherwise views without a photo are skipped and no views
             are generated.
-        use: what the message about generated views counts.
-        rough: see `GivenViews`.
     """
     prior = dense.sample
+    say = options.say
     wanted = ["train"] if options.held_out is not None else ["train", "test"]
-    asked = GivenViews(options.views, beside, options.up, options.config.recover.seed, rough=rough)
-    found, are_found = take_or_find_views(asked, prior, wanted, say)
-    plan = partial(_plan_views, dense, asked, progress=progress)
+    asked = options.request_views(beside)
+    found, are_found = take_or_find_views(asked, prior, wanted)
     select = replace(options.config.select, focus=options.focus)
-    mix = partial(
-        _add_other_kinds,
-        dense=dense,
-        count=count,
-        size=options.size,
-        rough=rough,
-        progress=progress,
-        say=say,
-    )
+    mix = partial(_add_other_kinds, dense=dense, given=asked, count=count, size=options.size)
     if found is None:
         if not teach:
             raise InputError(
@@ -154,9 +138,9 @@ def choose_views(
         held_out = None
         if options.held_out is not None:
             held_out = load_view_sets(options.held_out, [for_scores], None, say, unpictured=teach)[0].cameras
-        planned = plan(_POOL_VIEWS, grow=_POOL_GROWTH)
+        planned = _plan_views(dense, asked, _POOL_VIEWS, grow=_POOL_GROWTH)
         share = 1.0
-        if use != "merging":
+        if options.recovers:
             share = choose_pool_share(options.config.recover, prior, planned.cameras)
         views = _split_pool(
             planned,
@@ -168,14 +152,13 @@ def choose_views(
                 share=share,
                 learns=not is_untouched(options.config.recover, prior, count, dense.total),
             ),
-            use,
+            options.use,
             say,
             share=share,
         )
-        if use == "merging" or options.config.simplify.method == "paper":
+        if not options.recovers or options.config.simplify.method == "paper":
             return views
-        merging = choose_weighing_views(dense, asked, progress=progress)
-        return replace(views, merging=merging)
+        return replace(views, merging=choose_weighing_views(dense, replace(asked, say=unsaid)))
     train, test = given or split_views(found, options.held_out, say, unpictured=teach)
     if not are_found:
         check_sight(prior, train.cameras, say)
@@ -195,10 +178,10 @@ def choose_views(
     if not teach:
         return RunViews(train, test, full=full)
     try:
-        planned = plan(_OFFERED_VIEWS)
+        planned = _plan_views(dense, asked, _OFFERED_VIEWS)
     except InputError:  # the scene has no room for poses
         return RunViews(train, test, full=full)
-    weigh = partial(choose_draw_weights, prior, train, options.config, progress)
+    weigh = partial(choose_draw_weights, prior, train, options.config, options.progress)
     train, others, _ = mix(train, planned, select=select, weigh=weigh)
     return RunViews(train, test, *_halve_others(others), full=full)
 
@@ -238,7 +221,7 @@ def _split_pool(
     held_out: Cameras | None,
     size: int | None,
     mix: Callable[..., _Mixed],
-    use: Use,
+    use: str,
     say: Say,
     *,
     share: float = 1.0,
@@ -305,7 +288,7 @@ def take_spread_prefix(cameras: Cameras, share: float, least: int = 1) -> Camera
     return cameras.take(sorted(order))
 
 
-def _count_uses(use: Use, train: int, test: int, apart: int) -> str:
+def _count_uses(use: str, train: int, test: int, apart: int) -> str:
     """Count views by use.
 
     >>> _count_uses("distil", 112, 16, 48), _count_uses("merging", 112, 16, 48)
@@ -331,19 +314,18 @@ def _add_other_kinds(
     planned: Pool,
     *,
     dense: Dense,
+    given: GivenViews,
     count: int,
     select: SelectConfig,
     size: int | None,
-    progress: Progress,
-    say: Say,
     share: float = 1.0,
     learns: bool = True,
     weigh: Callable[[], NDArray[np.float64] | None] | None = None,
-    rough: bool = False,
 ) -> _Mixed:
     """Add views of other kinds to training views: those that `complete` chooses, or of one kind with a focus.
 
-    Some further views of each kind are set apart.
+    Some further views of each kind are set apart. If `given` is rough, as many views as usual are added
+    instead of chosen ones.
 
     Args:
         share: share of the pool that is used.
@@ -351,8 +333,8 @@ def _add_other_kinds(
         weigh: of given views, returns the weights with which they are drawn, or None if equally often. The
             others are drawn as often as these on average. None for planned views, which are not crowded;
             some of these become zooms.
-        rough: whether to add as many views as usual instead of choosing them.
     """
+    rough = given.rough
     usual = len(train.cameras)
     times = find_pool_growth(dense.total)
     spare = max(_LEAST_APART, round(_VIEWS_APART * times * share))
@@ -376,7 +358,7 @@ def _add_other_kinds(
             learned += _drop_same_places(planned.more(kind, most + spare), cameras)[: most - len(learned)]
         if kind == focus and len(learned) < 0.9 * most:
             room = f"room for {len(learned)} such views, {most} are wanted"
-            say(f"warning: --focus {kind}: the scene has {room}")
+            given.say(f"warning: --focus {kind}: the scene has {room}")
         offered += learned
         apart += scored
     others = Cameras.of(apart).fitted(size) if apart else None
@@ -386,7 +368,7 @@ def _add_other_kinds(
         if rough:
             more = take_evenly(more, round(_USUAL_OTHERS * usual))
         else:
-            compact, per_row = _merge_roughly(dense, count, progress)
+            compact, per_row = _merge_roughly(dense, count, given.progress)
             order, _, unseen = complete(
                 compact,
                 train.cameras,
@@ -394,7 +376,7 @@ def _add_other_kinds(
                 max(usual, least),
                 least_views=least,
                 represents=per_row,
-                progress=progress,
+                progress=given.progress,
             )
             more = more.take(order) if len(order) else None
     if more is None:
@@ -435,8 +417,6 @@ def find_or_plan_views(
     *,
     count: int | None = None,
     student: Splats | None = None,
-    progress: Progress = silent,
-    say: Say = unsaid,
 ) -> Views:
     """Return given views, views found beside the scene, or a generated pool with every 8th view held out.
 
@@ -445,30 +425,28 @@ def find_or_plan_views(
         student: a compact scene that will be recovered in a generated pool. Views of other kinds complete it
             as in `distill`, and further ones are in the splits `test` and, for validation, `val`.
     """
-    found, _ = take_or_find_views(given, scene, [], say)
+    found, _ = take_or_find_views(given, scene)
     if found is not None:
         return found
     grow = _POOL_GROWTH if count is None else 1.0
     count = _POOL_VIEWS if count is None else count
-    planned = _plan_views(InMemory(scene), given, count, progress=progress, grow=grow)
+    planned = _plan_views(InMemory(scene), given, count, grow=grow)
     if student is not None:
         mix = partial(
             _add_other_kinds,
             dense=InMemory(student),
+            given=given,
             count=len(student),
             select=SelectConfig(),
             size=None,
-            rough=given.rough,
-            progress=progress,
-            say=say,
         )
-        made = _split_pool(planned, None, None, mix, "distil", say)
+        made = _split_pool(planned, None, None, mix, "distil", given.say)
         assert made.pool is not None
         validation = made.validation or ()
         apart = made.apart or ()
         splits = (*made.pool.splits, *["val"] * len(validation), *["test"] * len(apart))
         return ViewSet(Cameras.of([*made.pool.cameras, *validation, *apart]), splits=splits)
-    say(f"views: {len(planned.cameras)} generated; {_describe_kinds(planned, planned.cameras)}")
+    given.say(f"views: {len(planned.cameras)} generated; {_describe_kinds(planned, planned.cameras)}")
     return ViewSet(planned.cameras, splits=splits_of(None, planned.cameras.names))
 
 
@@ -500,25 +478,18 @@ def is_planned(views: Views) -> bool:
     return isinstance(views, Cameras | ViewSet)
 
 
-def choose_looks(
-    scene: Splats,
-    count: int,
-    given: GivenViews,
-    *,
-    progress: Progress = silent,
-    say: Say = unsaid,
-) -> Cameras:
+def choose_looks(scene: Splats, count: int, given: GivenViews) -> Cameras:
     """Return the views that show a scene best, and those of a pool if `count` asks for more.
 
     They are chosen from the cameras of photos found beside the scene, if there are any.
     """
-    photos = _find_photo_views(scene, given, say)
+    photos = _find_photo_views(scene, given)
     best = best_views(scene, count, photos, size=given.shape, axis=given.up)
     if photos is None:
-        say(f"views: {count} generated")
+        given.say(f"views: {count} generated")
     if len(best) == count:
         return best
-    pool = _plan_views(InMemory(scene), given, count - len(best), progress=progress)
+    pool = _plan_views(InMemory(scene), given, count - len(best))
     return Cameras.of([*best, *pool.cameras])
 
 
@@ -531,18 +502,13 @@ def _describe_kinds(pool: Pool, cameras: Cameras) -> str:
     return f"{' + '.join(kinds)}{guess}"
 
 
-def choose_weighing_views(
-    dense: Dense,
-    given: GivenViews,
-    *,
-    progress: Progress = silent,
-    say: Say = unsaid,
-) -> Cameras | None:
+def choose_weighing_views(dense: Dense, given: GivenViews) -> Cameras | None:
     """Choose views for simplification's visibility: given, found beside the scene, or generated.
 
-    Arguments are those of `choose_views`; of `given` the training split is used. None means no views.
+    Of given views the training split is used. None means no views.
     """
-    found, are_found = take_or_find_views(given, dense.sample, ["train"], say)
+    say = given.say
+    found, are_found = take_or_find_views(given, dense.sample, ["train"])
     if found is not None:
         cameras = load_views(found, "train", None, say)
         if are_found:
@@ -550,7 +516,7 @@ def choose_weighing_views(
         warn_of_sight(dense.sample, cameras, say)
         return cameras
     try:
-        pool = _plan_views(dense, given, _WEIGHT_VIEWS, rows=_WEIGHT_ROWS, progress=progress)
+        pool = _plan_views(dense, given, _WEIGHT_VIEWS, rows=_WEIGHT_ROWS)
         others = [camera for kind, count in _WEIGHT_OTHERS.items() for camera in pool.more(kind, count)]
         return Cameras.of([*pool.cameras, *others])
     except InputError as e:
@@ -559,7 +525,7 @@ def choose_weighing_views(
 
 
 def _plan_views(
-    dense: Dense, given: GivenViews, count: int, *, rows: int = _POOL_SAMPLE, **options: Any
+    dense: Dense, given: GivenViews, count: int, *, rows: int = _POOL_SAMPLE, grow: float = 1.0
 ) -> Pool:
     """Plan a pool as `plan_pool` does, but larger in proportion to a large scene's size."""
     prior = dense.sample
@@ -567,8 +533,17 @@ def _plan_views(
     count = round(count * times)
     if given.rough:
         return _place_stand_ins(prior, count, given.shape)
-    options |= {"size": given.shape, "up": given.up, "seed": given.seed}
-    return plan_pool(prior, count, rows=round(rows * times), represents=dense.total / len(prior), **options)
+    return plan_pool(
+        prior,
+        count,
+        size=given.shape,
+        up=given.up,
+        seed=given.seed,
+        rows=round(rows * times),
+        grow=grow,
+        represents=dense.total / len(prior),
+        progress=given.progress,
+    )
 
 
 def _place_stand_ins(scene: Splats, count: int, size: tuple[int, int]) -> Pool:
@@ -629,7 +604,7 @@ def orbit(
     >>> len(orbit(scene, 4, size=(64, 48)))
     4
     """
-    photos = _find_photo_views(scene, GivenViews(None, beside, up, shape=size), say)
+    photos = _find_photo_views(scene, GivenViews(None, beside, up, shape=size, say=say))
     level = find_shared_up(photos) if up is None and photos is not None else None
     views, axis = turntable(scene, count, photos, size=size, axis=up if level is None else level)
     if up is None:
@@ -637,15 +612,15 @@ def orbit(
     return views
 
 
-def _find_photo_views(scene: Splats, given: GivenViews, say: Say) -> Cameras | None:
+def _find_photo_views(scene: Splats, given: GivenViews) -> Cameras | None:
     """Return cameras at the poses of the photos of a run, or of those beside a scene, if there are any."""
     beside = given.beside
     found: Views | None = None if beside is None else run_views(beside)
     if found is None or found == Path(str(beside)):
-        found, _ = take_or_find_views(replace(given, views=None), scene, [], say)
+        found, _ = take_or_find_views(replace(given, views=None), scene)
     cameras = None if found is None else load_views(found, "all", None)
     if cameras is None or not any(cameras.image_paths):
         return None
-    say(f"views: from {plural(len(cameras), 'photo')} of {found}")
+    given.say(f"views: from {plural(len(cameras), 'photo')} of {found}")
     bare = replace(cameras, image_paths=(), mask_paths=(), lenses=(), distortions=np.zeros((0, 5)))
     return bare.scaled(max(given.shape))

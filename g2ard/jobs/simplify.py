@@ -77,8 +77,6 @@ class Reduction:
     config: SimplifyConfig = field(default_factory=SimplifyConfig)
     recovered: bool = False
     notes: Sequence[Note] = ()
-    progress: Progress = silent
-    say: Say = unsaid
     _merged: dict[int, Merged] = field(default_factory=dict)
     plan: TilePlan | None = None
 
@@ -97,7 +95,7 @@ class Reduction:
                 if getattr(self.config, name) != getattr(Pairs, name):
                     raise InputError("has no effect on antialiased scenes", parameter=f"simplify.{name}")
         if self.plan is None:
-            say_regions(self.splats, self.config, "the scene", self.say)
+            say_regions(self.splats, self.config, "the scene", self.given.say)
         else:
             say_regions(self.splats, self.config, "a sample of the scene", unsaid)
 
@@ -126,7 +124,7 @@ class Reduction:
             last = list(self._merged.items())[-1:]
             seen = self.seen if count < self.total else None
             small = self.dense.merge(
-                count, seen, self.config, gaps=not self.recovered, progress=self.progress
+                count, seen, self.config, gaps=not self.recovered, progress=self.given.progress
             )
             self._merged = {**dict(last), count: small}
         return self._merged[count]
@@ -140,7 +138,7 @@ class Reduction:
             return self.cameras
         from g2ard.jobs.run_views import choose_weighing_views  # loads planning, which others do not need
 
-        return choose_weighing_views(self.dense, self.given, progress=self.progress, say=self.say)
+        return choose_weighing_views(self.dense, self.given)
 
     def warnings(self, small: Splats | PartsStream) -> list[str]:
         """Return warnings about the views, and about regions of a result that is in memory."""
@@ -164,7 +162,7 @@ class Reduction:
             sh_degree: of the result; None is the scene's.
         """
         splats = self.splats
-        say = self.say
+        say = self.given.say
         total = self.total
         if self.given.rough and (budget.min_psnr is not None or budget.min_ssim is not None):
             say("the run measures how many Gaussians keep the quality; here, a tenth")
@@ -210,32 +208,34 @@ class Reduction:
         from g2ard.poses import plan_pool  # as above
 
         splats = self.splats
+        progress = self.given.progress
+        say = self.given.say
         pool = plan_pool(
             splats,
             _QUALITY_VIEWS,
             seed=self.given.seed,
             rows=_POOL_SAMPLE,
             represents=self.total / len(splats),
-            progress=self.progress,
+            progress=progress,
         )
         cameras = pool.cameras.resized(_QUALITY_SIDE)
 
         def reduce(count: int) -> Splats:
             small = pass_through_file(load_whole(self(count).splats), file)
-            self.progress("quality", 0, 0)
+            progress("quality", 0, 0)
             return small
 
         drawn = self.dense.images(cameras)
         renders = [drawn[view] for view in range(len(cameras))]
         found, near = find_count_for_quality(renders, self.total, wanted, cameras, reduce)
         if found == self.total:
-            self.say(f"no smaller count was found that keeps the quality; keeping all {found:,} Gaussians")
+            self.given.say(
+                f"no smaller count was found that keeps the quality; keeping all {found:,} Gaussians"
+            )
         else:
             stage = " before recovery" if self.recovered else ""
             views = plural(len(cameras), "view")
-            self.say(
-                f"{plural(found, 'Gaussian')} keep {near}{stage}, in {views} generated to choose the count"
-            )
+            say(f"{plural(found, 'Gaussian')} keep {near}{stage}, in {views} generated to choose the count")
         return ResolvedBudget(
             found, file=file, wanted=wanted, renders=renders, cameras=cameras, total=self.total
         )
@@ -259,8 +259,6 @@ def open_reduction(
     planned: bool = False,
     counted: Callable[[int], None] = lambda total: None,
     given: GivenViews,
-    progress: Progress = silent,
-    say: Say = unsaid,
     **options: Any,
 ) -> Iterator[Reduction]:
     """Read a scene to be simplified, see `simplify`, or open its tiles.
@@ -271,19 +269,20 @@ def open_reduction(
         counted: called with the number of Gaussians before any work on them.
         options: other fields of `Reduction`.
     """
-    callbacks: dict[str, Any] = {"progress": progress, "say": say}
     if isinstance(scene, Splats):
         counted(len(scene))
-        yield Reduction(InMemory(scene), given, **options, **callbacks)
+        yield Reduction(InMemory(scene), given, **options)
         return
     given = replace(given, beside=given.beside or scene.path)
+    progress = given.progress
+    say = given.say
     if tiling is not None:
         from g2ard.jobs.dense import open_tiles
 
-        with open_tiles(scene, tiling, 1.0, options["config"], planned=planned, **callbacks) as tiles:
+        config = options["config"]
+        with open_tiles(scene, tiling, 1.0, config, planned=planned, progress=progress, say=say) as tiles:
             counted(tiles.plan.count)
-            options |= {"notes": tiles.notes, "plan": tiles.plan, **callbacks}
-            yield Reduction(tiles.dense, given, **options)
+            yield Reduction(tiles.dense, given, notes=tiles.notes, plan=tiles.plan, **options)
         return
     progress("read", 0, 0)
     if scene.kind == "points":
@@ -293,7 +292,7 @@ def open_reduction(
         splats = load_scene(scene, say)
         notes = scene.notes
     counted(len(splats))
-    yield Reduction(InMemory(splats), given, notes=notes, **options, **callbacks)
+    yield Reduction(InMemory(splats), given, notes=notes, **options)
 
 
 @checks_arguments
@@ -373,11 +372,10 @@ def simplify(
     config = configure(config or SimplifyConfig(), settings=given | dict(settings or {}))
     wanted = Budget(parse_count(count), ratio, fit=fit, min_psnr=min_psnr, min_ssim=min_ssim)
     name = "scene" if isinstance(scene, Splats) else str(scene)
-    given_views = GivenViews(views, beside, up, seed)
-    inputs: dict[str, Any] = {"given": given_views, "blind": blind, "progress": progress, "say": say}
+    given_views = GivenViews(views, beside, up, seed, progress=progress, say=say)
     source = scene if isinstance(scene, Splats) else Source(scene, render_model)
     PointChoice(box, where, color).narrow(source, progress)
-    with open_reduction(source, config=config, **inputs) as reduce:
+    with open_reduction(source, given=given_views, blind=blind, config=config) as reduce:
         budget = reduce.resolve(wanted, name, f"scene.{format}")
         small = reduce(budget.count)
     assert isinstance(small, Simplified)  # not in tiles

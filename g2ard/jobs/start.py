@@ -24,7 +24,7 @@ from g2ard.jobs.start_points import (
     top_up_points,
 )
 from g2ard.pipeline.dense import Dense, InMemory
-from g2ard.progress import Progress, Say
+from g2ard.progress import Say
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats
 from g2ard.stages.lift import in_axes, lift, lift_rows
@@ -67,12 +67,12 @@ class Start:
     views: tuple[ViewSet, Cameras] | None = None
 
 
-def describe_tiled_start(scene: Source, options: DistillOptions, tiles: Opened, say: Say) -> Start:
+def describe_tiled_start(scene: Source, options: DistillOptions, tiles: Opened) -> Start:
     """Describe a scene in tiles, or the lift of a point cloud."""
     lifted = scene.kind == "points"
     with_photos = tiles.views is not None
     if lifted and not with_photos:
-        say(_NO_PHOTOS)
+        options.say(_NO_PHOTOS)
     return Start(
         tiles.dense,
         str(scene),
@@ -84,20 +84,10 @@ def describe_tiled_start(scene: Source, options: DistillOptions, tiles: Opened, 
     )
 
 
-def read_start(
-    scene: Given,
-    budget: Budget | None,
-    options: DistillOptions,
-    progress: Progress,
-    say: Say,
-    *,
-    planned: bool = False,
-) -> Start:
-    """Read the dense scene, or lift points; with photos they are topped up to the budget.
-
-    Args:
-        planned: see `g2ard.jobs.distill.open_job`.
-    """
+def read_start(scene: Given, budget: Budget | None, options: DistillOptions) -> Start:
+    """Read the dense scene, or lift points; with photos they are topped up to the budget."""
+    progress = options.progress
+    say = options.say
     if isinstance(scene, Splats):
         options.check_trained()
         return Start(InMemory(scene.narrowed()), "scene", options.beside, len(scene))
@@ -107,7 +97,7 @@ def read_start(
         splats = load_scene(scene.drawn_as(options.render_model), say)
         return Start(InMemory(splats), str(scene), options.beside or scene.path, len(splats))
     if options.photo_views is not None:
-        return _read_photo_start(scene, options.photo_views, budget, options, progress, say, planned=planned)
+        return _read_photo_start(scene, options.photo_views, budget, options)
     if scene is None:
         raise InputError("missing; without a scene, pass photos with poses as views", parameter="scene")
     name = "cloud" if isinstance(scene, Points) else str(scene)
@@ -121,22 +111,17 @@ def read_start(
 
 
 def _read_photo_start(
-    scene: Points | Source | None,
-    views: Views,
-    budget: Budget | None,
-    options: DistillOptions,
-    progress: Progress,
-    say: Say,
-    *,
-    planned: bool,
+    scene: Points | Source | None, views: Views, budget: Budget | None, options: DistillOptions
 ) -> Start:
     """Lift a cloud that goes with photos, or the photos' own points, topped up to the budget."""
+    progress = options.progress
+    say = options.say
     split = split_views(views, options.held_out, say)
     train = split[0].cameras
     cloud, name, of_photos = _read_cloud(scene, views, train, say)
     points: Points | None = None
     if cloud is not None:
-        own = cloud.points if planned else colored(cloud, train, name, progress=progress, say=say)
+        own = cloud.points if options.planned else colored(cloud, train, name, progress=progress, say=say)
         points = distinct(own)
     found = 0 if points is None else len(points)
     usual = None
@@ -152,7 +137,7 @@ def _read_photo_start(
         )
     if points is None or scene is None or found < wanted:
         of_photos = True
-        if planned:
+        if options.planned:
             points = scatter_points(points, train, wanted)
         else:
             points = top_up_points(

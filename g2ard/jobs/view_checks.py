@@ -50,7 +50,7 @@ _BLIND_VIEWS_SHARE = 0.1
 
 
 def take_or_find_views(
-    given: GivenViews, splats: Splats, splits: Sequence[str], say: Say
+    given: GivenViews, splats: Splats, splits: Sequence[str] = ()
 ) -> tuple[Views | None, bool]:
     """Return given views, or those found beside a scene, and whether they were found; None to generate some.
 
@@ -64,6 +64,7 @@ def take_or_find_views(
     path = None if given.beside is None else find_views(given.beside)
     if path is None:
         return None, False
+    say = given.say
     try:
         found = read_view_set(path, unpictured=True)
         for split in splits:

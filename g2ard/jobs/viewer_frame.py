@@ -16,7 +16,6 @@ from g2ard.jobs.inputs import GivenViews, load_views
 from g2ard.jobs.view_checks import sample_opaque_points, take_or_find_views
 from g2ard.poses import best_views
 from g2ard.poses.site import Site
-from g2ard.progress import Say, unsaid
 from g2ard.scene.cameras import Camera, Cameras
 from g2ard.scene.samples import take_evenly
 from g2ard.scene.splats import Splats
@@ -100,13 +99,7 @@ class ViewerFrame:
         )
 
 
-def choose_frame(
-    scene: Splats,
-    given: GivenViews,
-    *,
-    start: str | None = None,
-    say: Say = unsaid,
-) -> ViewerFrame:
+def choose_frame(scene: Splats, given: GivenViews, start: str | None = None) -> ViewerFrame:
     """Choose a frame and an initial camera, from views that are given or found beside the scene, if any.
 
     Args:
@@ -114,14 +107,14 @@ def choose_frame(
         given: the views, and the up direction; None takes it from the views, or estimates it.
         start: name of the initial view; None takes the one that shows most.
     """
-    found, _ = take_or_find_views(given, scene, [], say)
-    cameras = None if found is None else load_views(found, "all", None, say)
+    found, _ = take_or_find_views(given, scene)
+    cameras = None if found is None else load_views(found, "all", None, given.say)
     try:
         return place_frame(scene, cameras, given.up, start=start)
     except InputError as error:
         if start is not None or cameras is not None:
             raise
-        say(f"no pose to start at: {error}")
+        given.say(f"no pose to start at: {error}")
         return ViewerFrame(_rotate_upright(up_of(scene, given.up)), _find_middle(scene))
 
 

@@ -24,6 +24,7 @@ from g2ard.jobs.budget_search import (
 from g2ard.jobs.close_up import close_up
 from g2ard.jobs.distill import prepare
 from g2ard.jobs.distill_options import DistillOptions
+from g2ard.jobs.inputs import GivenViews
 from g2ard.jobs.simplify import Reduction
 from g2ard.pipeline.dense import InMemory
 from g2ard.scene.splats import Splats
@@ -124,7 +125,7 @@ def test_simplify_fits(tmp_path: Path, command_line: CommandLine) -> None:
 @pytest.mark.parametrize("recovered", [False, True])
 def test_quest3_bounds_overdraw(recovered: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     scene, said = checkered_ball(3000), []
-    reduce = Reduction(InMemory(scene), blind=True, recovered=recovered, say=said.append)
+    reduce = Reduction(InMemory(scene), GivenViews(say=said.append), blind=True, recovered=recovered)
     plain = reduce.resolve(Budget(fit="quest3"), "a", "a.ply")
     assert plain.count == reduce.resolve(Budget(fit="web"), "a", "a.ply").count == 3000
     dense = close_up(scene)
@@ -146,8 +147,8 @@ def test_quest3_bounds_overdraw(recovered: bool, monkeypatch: pytest.MonkeyPatch
 def test_distill_measures_the_simplification_that_it_makes(settings: dict[str, Any]) -> None:
     said: list[str] = []
     settings = {"steps": 1, "focus": "far", **settings}  # no views of other kinds, which take longest
-    options = DistillOptions(views=around(16, (48, 36)), size=48, settings=settings)
-    job = prepare(checkered_ball(800), Budget(min_psnr=24), options, say=said.append)
+    options = DistillOptions(views=around(16, (48, 36)), size=48, settings=settings, say=said.append)
+    job = prepare(checkered_ball(800), Budget(min_psnr=24), options)
     judged = job.budget.judge(job.run().simplified)
     assert judged is not None
     kept = judged[1].partition(" in the 12 views")[0]

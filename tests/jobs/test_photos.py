@@ -143,7 +143,7 @@ def test_points_of_photos_move_however_small_they_are(
     photos_of(tmp_path / "photos", points=True)
     (tmp_path / "scan.ply").write_bytes((tmp_path / "photos" / "sparse.ply").read_bytes())
     options = DistillOptions(views=tmp_path / "photos", settings={"recover.steps": 3, **settings})
-    job = prepare(scene and Source(tmp_path / scene), Budget(500), options, progress=silent, say=unsaid)
+    job = prepare(scene and Source(tmp_path / scene), Budget(500), options)
     assert job.config.recover.schedule.finest == finest
     assert job.config.recover.from_points == (finest != 1.0)
 

@@ -71,10 +71,10 @@ def test_an_interrupted_run_keeps_its_time(tmp_path: Path, monkeypatch: pytest.M
             signal.raise_signal(signal.SIGINT)
 
     scene, budget = checkered_ball(1200), Budget(ratio=8)
-    options = DistillOptions(size=48, time=60.0)
+    options = DistillOptions(size=48, time=60.0, progress=stop)
     with pytest.raises(KeyboardInterrupt):
-        prepare(scene, budget, options, progress=stop).run(tmp_path)
-    done = prepare(scene, budget, options).run(tmp_path)
+        prepare(scene, budget, options).run(tmp_path)
+    done = prepare(scene, budget, DistillOptions(size=48, time=60.0)).run(tmp_path)
     assert done.report.rounds[-1].recover[-1].seconds < 10
     assert next(limits) == 99.0
 

@@ -191,7 +191,8 @@ def test_a_scanned_cloud_and_photos_are_distilled(command_line: CommandLine, tmp
 @pytest.mark.parametrize(("ratio", "measured"), [(1.0, False), (10.0, True)])
 def test_no_coverage_is_measured_where_nothing_is_learned(ratio: float, measured: bool) -> None:
     stages: set[str] = set()
-    prepare(PRIOR, Budget(ratio=ratio), DistillOptions(), progress=lambda stage, *_: stages.add(stage))
+    options = DistillOptions(progress=lambda stage, *_: stages.add(stage))
+    prepare(PRIOR, Budget(ratio=ratio), options)
     assert ("coverage" in stages) == measured
 
 

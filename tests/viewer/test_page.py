@@ -234,11 +234,11 @@ def test_a_page_starts_at_a_typical_view_with_detail_or_the_one_named() -> None:
 
 def test_a_scene_without_views_is_looked_at_from_around_and_one_without_room_as_a_whole() -> None:
     said: list[str] = []
-    stand = choose_frame(checkered_ball(500), GivenViews(), say=said.append)
+    stand = choose_frame(checkered_ball(500), GivenViews(say=said.append))
     assert stand.name
     assert stand.name == "view_0000"
     nothing = Splats.create([[0, 0, 0]], scales=[[1, 1, 1]], logit_opacities=[-20])
-    assert choose_frame(nothing, GivenViews(), say=said.append).start is None
+    assert choose_frame(nothing, GivenViews(say=said.append)).start is None
     assert "no pose to start at" in said[-1]
     with pytest.raises(InputError):
         choose_frame(nothing, GivenViews(), start="pose_0000")

@@ -66,9 +66,8 @@ def compare(
     given = opt.with_images(views, images)
     found = find_or_plan_views(
         dense,
-        GivenViews(given, sources[0].file, None, run.seed, choose_plan_size(size)),
+        GivenViews(given, sources[0].file, None, run.seed, choose_plan_size(size), **run.callbacks),
         count=looks,
-        **run.callbacks,
     )
     cameras = resize_views(load_views(found, "all", None, run.say), size, made=is_planned(found))
     check_sight(dense, cameras, run.say)

@@ -138,13 +138,15 @@ def distill(
         time=time,
         memory=tiling.memory,
         settings=settings,
+        planned=dry_run,
+        **run.callbacks,
     )
     how = tiling if source is not None and is_tiled(source, tiling) else None
     if scene is not None and budget is not None and how is None:
         say_fit(run, scene, budget, f"scene.{format}")
     written = None if dry_run else how
     held = work_folder(run, written, options.views, options.held_out, again=" with --resume")
-    with held, open_job(source, budget, options, how, planned=dry_run, **run.callbacks) as job:
+    with held, open_job(source, budget, options, how) as job:
         cost = cost_of(job, job.budget.count, page=page)
         if dry_run:
             tell_plan(run, job.budget.count, cost, job.plan)

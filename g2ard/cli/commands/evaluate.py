@@ -123,7 +123,7 @@ def evaluate(
         dense, colour, chosen=chosen is not None, insisted=photos, settings=settings, say=run.say
     )
     if dense is not None:
-        given = find_or_plan_views(dense, GivenViews(given, teacher, seed=run.seed), **run.callbacks)
+        given = find_or_plan_views(dense, GivenViews(given, teacher, seed=run.seed, **run.callbacks))
     assert given is not None  # `check_teacher`
     full = load_views(given, split, None, run.say, unpictured=dense is not None)
     fitted = full.fitted(size)

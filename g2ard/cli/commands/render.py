@@ -132,12 +132,10 @@ def render(
     found: Any
     if turn is not None:
         found = orbit(splats, turn, size=choose_plan_size(size), up=up, beside=scene, say=run.say)
-    elif looks is not None:
-        given = GivenViews(None, None if is_made(views) else scene, up, run.seed, choose_plan_size(size))
-        found = choose_looks(splats, looks, given, **run.callbacks)
     else:
-        given = GivenViews(views, scene, up, run.seed, choose_plan_size(size))
-        found = find_or_plan_views(splats, given, **run.callbacks)
+        beside = None if is_made(views) else scene
+        given = GivenViews(views, beside, up, run.seed, choose_plan_size(size), **run.callbacks)
+        found = find_or_plan_views(splats, given) if looks is None else choose_looks(splats, looks, given)
     cameras = load_views(found, split, None, run.say)
     if around:
         cameras = stations(cameras)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -120,13 +120,16 @@ def simplify(
 
     began = time.perf_counter()
     reports = []
-    inputs: dict[str, Any] = {
-        "given": GivenViews(given, None, up, run.seed, rough=dry_run),
-        "blind": no_views,
-    }
-    inputs |= {"planned": dry_run, "counted": counted, **run.callbacks}
-    held = work_folder(run, None if dry_run else how, given)
-    with held, open_reduction(source, how, config=config, **inputs) as reduce:
+    opening = open_reduction(
+        source,
+        how,
+        planned=dry_run,
+        counted=counted,
+        given=GivenViews(given, None, up, run.seed, rough=dry_run, **run.callbacks),
+        blind=no_views,
+        config=config,
+    )
+    with work_folder(run, None if dry_run else how, given), opening as reduce:
         reading = (started := time.perf_counter()) - began  # shared by all budgets
         wanted = [reduce.resolve(budget, str(scene), name) for budget in budgets]
         if outputs is None:

@@ -111,7 +111,7 @@ def _write(
     loaded = [run.load(source) for source in sources]
     if views is None and scene.is_dir() and (own := scene / "views.json").is_file():
         views = own if any(read_views(own).image_paths) else "made"  # generated ones show what trains
-    stand = choose_frame(loaded[0], GivenViews(views, sources[0].file, up), start=start, say=run.say)
+    stand = choose_frame(loaded[0], GivenViews(views, sources[0].file, up, say=run.say), start)
     labels = label_scenes(sources, [len(splats) for splats in loaded], roles)
     known = opt.background_of(run, background, scene, other)
     opened = sources[shown.index(scene)]
