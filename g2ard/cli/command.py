@@ -26,7 +26,7 @@ from g2ard.cli.fields import FIELDS
 from g2ard.cli.panels import Command, in_panel, ordered
 from g2ard.cli.run import Run
 from g2ard.cli.usage import is_typed, map_flags, spell_in_flags
-from g2ard.config.choices import PointColor, RenderModel
+from g2ard.config.choices import Named, PointColor, RenderModel
 from g2ard.errors import G2ardError
 from g2ard.progress import plural
 from g2ard.system import devices, interrupt
@@ -43,7 +43,7 @@ _EXCLUSIVE_OPTIONS = (
 """Options that exclude each other."""
 
 
-def _prefer_flags(ctx: typer.Context, values: dict[str, Any], defaults: dict[str, Any]) -> None:
+def _prefer_flags(ctx: typer.Context, values: Named, defaults: Named) -> None:
     """Let typed flags override options of the config file that they exclude."""
     for pair in _EXCLUSIVE_OPTIONS:
         for flag, other in (pair, pair[::-1]):
@@ -201,7 +201,7 @@ def _create_parameter(name: str, kind: Any, option: Any, default: Any = None) ->
     return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
 
 
-def _execute(run: Run, fn: Callable[..., None], options: dict[str, Any]) -> None:
+def _execute(run: Run, fn: Callable[..., None], options: Named) -> None:
     if run.device not in ("auto", "cpu", "gpu"):
         raise typer.BadParameter(f"--device: expected auto, cpu or gpu, got {run.device!r}")
     try:

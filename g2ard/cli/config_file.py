@@ -13,6 +13,7 @@ import typer
 
 from g2ard.cli.budget_options import Count
 from g2ard.cli.usage import suggest_names
+from g2ard.config.choices import Named
 from g2ard.errors import InputError
 
 _NOT_KEPT = ("config", "print_config", "overwrite", "resume")
@@ -44,7 +45,7 @@ def load_config(ctx: typer.Context, path: Path | None) -> Path | None:
     settings = _flatten(top.pop("set", {})) | _flatten(own.pop("set", {}))
     if settings and "set" not in commands[name]:
         raise typer.BadParameter(f"{path}: `{name}` has no settings; remove `set`")
-    found: dict[str, Any] = {}
+    found: Named = {}
     for key, value in {**top, **own}.items():
         parameter = commands[name].get(_write_dashes(key))
         if parameter is not None:  # otherwise an option of another command
@@ -55,7 +56,7 @@ def load_config(ctx: typer.Context, path: Path | None) -> Path | None:
     return path
 
 
-def _read_toml(path: Path) -> dict[str, Any]:
+def _read_toml(path: Path) -> Named:
     import tomllib
 
     from g2ard.io.paths import read_text
@@ -70,7 +71,7 @@ def _read_toml(path: Path) -> dict[str, Any]:
         raise typer.BadParameter(f"{path}: {e}{hint}") from None
 
 
-def _find_parameters(ctx: typer.Context, path: Path, tables: Iterable[str]) -> dict[str, dict[str, Any]]:
+def _find_parameters(ctx: typer.Context, path: Path, tables: Iterable[str]) -> dict[str, Named]:
     """Return the parameters of this command and of those with a table, by command and dashed name."""
     from g2ard.cli.app import COMMANDS, app, register_commands
 
@@ -80,8 +81,8 @@ def _find_parameters(ctx: typer.Context, path: Path, tables: Iterable[str]) -> d
         raise typer.BadParameter(f"{path}: unknown command {suggest_names(strange, {*COMMANDS, name})}")
     for other in others:
         register_commands(other)
-    commands: dict[str, Any] = getattr(typer.main.get_command(app), "commands", {}) if others else {}
-    found: dict[str, dict[str, Any]] = {}
+    commands: Named = getattr(typer.main.get_command(app), "commands", {}) if others else {}
+    found: dict[str, Named] = {}
     for command in (name, *others):
         found[command] = {}
         for parameter in (ctx.command if command == name else commands[command]).params:
@@ -90,7 +91,7 @@ def _find_parameters(ctx: typer.Context, path: Path, tables: Iterable[str]) -> d
     return found
 
 
-def _check_keys(table: dict[str, Any], known: dict[str, Any], problem: str) -> None:
+def _check_keys(table: Named, known: Named, problem: str) -> None:
     """Reject unknown keys, with similar names, and letters of options that have a longer name."""
     told = []
     long = [flag for flag in known if len(flag) > 1]
@@ -121,13 +122,13 @@ def _write_dashes(key: str) -> str:
     return key.replace("_", "-")
 
 
-def _flatten(table: Any, prefix: str = "") -> dict[str, Any]:
+def _flatten(table: Any, prefix: str = "") -> Named:
     """Return a nested table of settings by dotted path, since TOML nests `simplify.max_energy = 0.02`."""
     if not isinstance(table, dict):
         raise typer.BadParameter(
             "set: expected a table of settings, such as set = { simplify.max_energy = 0.02 }"
         )
-    out: dict[str, Any] = {}
+    out: Named = {}
     for key, value in table.items():
         out |= _flatten(value, f"{prefix}{key}.") if isinstance(value, dict) else {prefix + key: value}
     return out
@@ -142,7 +143,7 @@ def _write_as_typed(value: Any) -> Any:
     return str(value).lower() if isinstance(value, bool) else str(value)
 
 
-def write_config(ctx: typer.Context, values: dict[str, Any]) -> str:
+def write_config(ctx: typer.Context, values: Named) -> str:
     """Format a call's inputs and options, with defaults but without None, for `load_config`."""
     lines = [f"[{ctx.info_name}]"]
     constants: list[str] = []

@@ -10,6 +10,7 @@ from typing import Any
 import typer
 
 from g2ard.cli.run import Run
+from g2ard.config.choices import Named
 from g2ard.errors import InputError, OutputError
 from g2ard.io import check_scene_output
 from g2ard.io.atomic import (
@@ -83,7 +84,7 @@ def _find_changed_files(run: Run, known: Mapping[str, Any]) -> list[str]:
     return lost + [name for name, identity in present.items() if identity != known.get(name)]
 
 
-def identify_files(files: Iterable[Path]) -> dict[str, Any]:
+def identify_files(files: Iterable[Path]) -> Named:
     """Return the identity of each file by its path, relative to the working folder if it is inside."""
     here = real_path(".")
     absolute = {real_path(path) for path in files}
@@ -91,7 +92,7 @@ def identify_files(files: Iterable[Path]) -> dict[str, Any]:
     return dict(zip(map(str, paths), file_identity(paths), strict=True))
 
 
-def read_record(output: Path) -> dict[str, Any] | None:
+def read_record(output: Path) -> Named | None:
     """Return the options and inputs of the command that finished the output, or None if that is not known,
     as of an output that was moved or is another file."""
     file = _place_record(output)

@@ -16,7 +16,7 @@ from g2ard.cli.budget_options import Counts, Ratios
 from g2ard.cli.claims import Claims
 from g2ard.cli.console import Console
 from g2ard.cli.usage import spell_in_flags
-from g2ard.config.choices import RenderModel, ViewFormat
+from g2ard.config.choices import Named, RenderModel, ViewFormat
 from g2ard.config.schema import Config, full_paths, parse_settings
 from g2ard.errors import InputError
 from g2ard.io import Source, write_views
@@ -44,8 +44,8 @@ class Run(Claims):
     def __init__(
         self,
         name: str,
-        common: dict[str, Any],
-        options: dict[str, Any],
+        common: Named,
+        options: Named,
         flags: Mapping[str, str] = MappingProxyType({}),
         outputs: Collection[str] = ("output",),
         fields: Sequence[str] = (),
@@ -73,11 +73,11 @@ class Run(Claims):
         self.config = {name: _flat(value) for name, value in told.items()}
 
     @property
-    def callbacks(self) -> dict[str, Any]:
+    def callbacks(self) -> Named:
         """Arguments of jobs that report progress and messages."""
         return {"progress": self.progress, "say": self.say}
 
-    def settle(self, config: Config, preset: str | None = None) -> tuple[dict[str, Any], Config]:
+    def settle(self, config: Config, preset: str | None = None) -> tuple[Named, Config]:
         """Merge flags of settings and --set, which wins, into values by path and the config that they make.
 
         Args:
@@ -187,7 +187,7 @@ class Run(Claims):
         to_file = self.json not in (None, "-")
         self.say(f"dry run: only {self.json} is written" if to_file else "dry run: nothing is written")
 
-    def result(self, data: dict[str, Any]) -> None:
+    def result(self, data: Named) -> None:
         """Write the result and the resolved options to --json."""
         if self.json is None:
             return
@@ -204,7 +204,7 @@ class Run(Claims):
             with atomic_output(Path(self.json), overwrite=self.overwrite) as temporary:
                 temporary.write_text(text + "\n", encoding="utf-8", newline="\n")
 
-    def results(self, reports: list[dict[str, Any]]) -> None:
+    def results(self, reports: list[Named]) -> None:
         """Write the result of one budget, or of several under `runs`."""
         self.result(reports[0] if len(reports) == 1 else {"runs": reports})
 

@@ -22,7 +22,7 @@ from g2ard.cli.resume import (
     list_finished_steps,
 )
 from g2ard.cli.run import Run
-from g2ard.config.choices import BLACK, WHITE, Colour, ViewFormat
+from g2ard.config.choices import BLACK, WHITE, Colour, Named, ViewFormat
 from g2ard.errors import InputError, OutputError
 from g2ard.io import Source, write_views
 from g2ard.io.atomic import atomic_output, check_output, drop_empty, drop_temporaries
@@ -83,9 +83,9 @@ class RunFolder:
         self._view = path / "view.html"
         self._views = path / "views.json"
         self._scored = path / "scored.json"  # if some scored views are not in views.json
-        self._inputs: dict[str, Any] = {}  # identity of each file that this run reads
+        self._inputs: Named = {}  # identity of each file that this run reads
 
-    def check(self, budget: Budget | None) -> dict[str, Any] | None:
+    def check(self, budget: Budget | None) -> Named | None:
         """Return the report of a finished run if --resume finds one; raise an `OutputError` unless the run
         may write here."""
         self._run.spare_inputs(
@@ -109,7 +109,7 @@ class RunFolder:
             check_stopped(self._run, self.unfinished, self._resume, self.scene)
         return None
 
-    def _read_finished(self, budget: Budget | None) -> dict[str, Any]:
+    def _read_finished(self, budget: Budget | None) -> Named:
         """Return the finished run's report; raise an `OutputError` if its budget, options or input files were
         others."""
         record = read_json(self._report)
@@ -320,7 +320,7 @@ def _join_views(cameras: Cameras, held_out: Cameras) -> Cameras:
     return Cameras.of([*cameras, *named])
 
 
-def describe_stopped_run(folder: Path) -> dict[str, Any] | None:
+def describe_stopped_run(folder: Path) -> Named | None:
     """Describe an interrupted run (checkpoints, counts, options), or return None without one."""
     work = folder / _WORK_FOLDER
     if not has_checkpoints(work):

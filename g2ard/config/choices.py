@@ -3,7 +3,10 @@
 This module imports nothing heavy, so that `--help` stays fast.
 """
 
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
+
+Named = dict[str, Any]
+"""Values by name: options, figures of a report."""
 
 Colour = tuple[float, float, float]
 """RGB in [0, 1]."""

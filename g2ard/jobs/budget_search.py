@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from g2ard.arrays import Values
 from g2ard.errors import InputError
 from g2ard.io import write_splats
 from g2ard.io.scene_formats import scene_format, written_bytes
@@ -185,7 +185,7 @@ def find_count_for_layers(count: int, most: float, reduce: Callable[[int], Splat
     return count, layers
 
 
-def render_clipped(splats: Splats, cameras: Cameras) -> list[NDArray[Any]]:
+def render_clipped(splats: Splats, cameras: Cameras) -> list[Values]:
     renderer = Renderer(splats)
     return [renderer.clipped(camera) for camera in cameras]
 
@@ -200,7 +200,7 @@ def measure_quality(renders: list[Any], splats: Splats, cameras: Cameras) -> Qua
 
 
 def find_count_for_quality(
-    renders: list[NDArray[Any]],
+    renders: list[Values],
     total: int,
     wanted: Quality,
     cameras: Cameras,
@@ -275,7 +275,7 @@ class ResolvedBudget:
     bytes: int | None = None
     file: str = "scene.ply"
     wanted: Quality | None = None
-    renders: list[NDArray[Any]] = field(default_factory=list)
+    renders: list[Values] = field(default_factory=list)
     cameras: Cameras | None = None
     total: int = 0
 

@@ -9,9 +9,8 @@ from functools import partial
 from typing import Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
-from g2ard.arrays import Float32
+from g2ard.arrays import Float, Float32, Mask, Values
 from g2ard.config.choices import PointColor
 from g2ard.config.schema import Settings
 from g2ard.errors import InputError, require
@@ -209,7 +208,7 @@ class ChosenPoints(PointStream):
                 columns = values[:, own + self._also.index(self._shade) :][:, :1]
             yield positions[keep], columns[keep], noise[keep]
 
-    def _kept(self, positions: NDArray[np.float64], values: Float32) -> NDArray[np.bool_]:
+    def _kept(self, positions: Float, values: Float32) -> Mask:
         """Return the (n,) mask of points to keep.
 
         Args:
@@ -226,8 +225,8 @@ class ChosenPoints(PointStream):
         if where is None:
             return keep
 
-        def column(name: str) -> NDArray[Any]:
-            found: NDArray[Any]
+        def column(name: str) -> Values:
+            found: Values
             if name in _PLACE:
                 found = positions[:, _PLACE.index(name)]
             elif name in _SHADES:
@@ -243,7 +242,7 @@ class ChosenPoints(PointStream):
         except InputError as error:
             raise error.at(path=self.path) from None
 
-    def _widen(self, name: str, values: NDArray[Any]) -> None:
+    def _widen(self, name: str, values: Values) -> None:
         finite = values[np.isfinite(values)]
         if finite.size:
             known = self.ranges.get(name, (np.inf, -np.inf))

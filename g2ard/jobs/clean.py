@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,7 +12,7 @@ from numpy.typing import ArrayLike
 from g2ard.config.checks import checks_arguments
 from g2ard.config.choices import RenderModel
 from g2ard.errors import InputError, require
-from g2ard.jobs.inputs import load_scene
+from g2ard.jobs.inputs import Scene, load_scene
 from g2ard.jobs.run_views import find_pool_growth
 from g2ard.pipeline.dense import Dense, InMemory
 from g2ard.poses import plan_pool
@@ -66,7 +65,7 @@ class Cleaned(Shown):
 
 @checks_arguments
 def clean(
-    scene: Splats | str | Path,
+    scene: Scene,
     *,
     only: Sequence[str] | None = None,
     strength: float = 0.0,

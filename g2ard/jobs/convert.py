@@ -8,9 +8,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 import g2ard.io.spz as spz
+from g2ard.arrays import Float
 from g2ard.config.checks import Degree, Positive, checks_arguments
 from g2ard.config.choices import AxesName, PointColor, RenderModel
 from g2ard.config.schema import Settings
@@ -18,7 +19,7 @@ from g2ard.errors import InputError, require
 from g2ard.io import Source
 from g2ard.io.scene_formats import FORMATS
 from g2ard.jobs.chosen_points import PointChoice
-from g2ard.jobs.inputs import lift_cloud, load_scene
+from g2ard.jobs.inputs import Numbers, Scene, lift_cloud, load_scene
 from g2ard.progress import Progress, Say, silent, unsaid
 from g2ard.scene.conditions import check_condition, fulfilling
 from g2ard.scene.splats import Splats
@@ -33,21 +34,19 @@ from g2ard.scene.transform import (
     with_axes,
 )
 
-Scene = Splats | str | Path
-
 
 @dataclass(frozen=True, eq=False)
 class Changes(Settings):
     """Changes to a scene, checked when they are made; fields are arguments of `convert`."""
 
-    box: Sequence[float] | None = None
-    sphere: Sequence[float] | None = None
+    box: Numbers | None = None
+    sphere: Numbers | None = None
     invert: bool = False
     where: str | None = None
     transform: ArrayLike | None = None
     scale: Positive | None = None
-    rotate: Sequence[float] | None = None
-    translate: Sequence[float] | None = None
+    rotate: Numbers | None = None
+    translate: Numbers | None = None
     recentre: bool = False
     to_axes: AxesName | None = None
     sh_degree: Degree | None = None
@@ -93,7 +92,7 @@ class Changes(Settings):
             return splats
         return replace(with_axes(splats, change_of_axes(splats.axes, self.to_axes)), axes="RDF")
 
-    def _matrix(self) -> NDArray[np.float64] | None:
+    def _matrix(self) -> Float | None:
         """Return the (4, 4) matrix of `transform` and then of `scale`, `rotate` and `translate`."""
         matrix = None if self.transform is None else np.asarray(self.transform, np.float64)
         if not any(given is not None for given in (self.scale, self.rotate, self.translate)):
@@ -109,14 +108,14 @@ class Changes(Settings):
 def convert(
     scenes: Scene | Sequence[Scene],
     *,
-    box: Sequence[float] | None = None,
-    sphere: Sequence[float] | None = None,
+    box: Numbers | None = None,
+    sphere: Numbers | None = None,
     invert: bool = False,
     where: str | None = None,
     transform: ArrayLike | None = None,
     scale: float | None = None,
-    rotate: Sequence[float] | None = None,
-    translate: Sequence[float] | None = None,
+    rotate: Numbers | None = None,
+    translate: Numbers | None = None,
     recentre: bool = False,
     from_axes: AxesName | None = None,
     to_axes: AxesName | None = None,
@@ -175,7 +174,7 @@ def open_scenes(
     scenes: Scene | Sequence[Scene], render_model: RenderModel | None = None
 ) -> Source | list[Splats | Source]:
     """Return scenes that are not read yet; point clouds alone become one."""
-    several = [scenes] if isinstance(scenes, Splats | str | Path) else list(scenes)
+    several = [scenes] if isinstance(scenes, Scene) else list(scenes)
     sources = [scene if isinstance(scene, Splats) else Source(scene, render_model) for scene in several]
     if sources and all(isinstance(one, Source) and one.kind == "points" for one in sources):
         first, *others = (Path(one) for one in several if not isinstance(one, Splats))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
@@ -23,7 +23,7 @@ from g2ard.jobs.chosen_points import PointChoice
 from g2ard.jobs.clean import remove_clutter
 from g2ard.jobs.distill_job import DistillJob
 from g2ard.jobs.distill_options import DistillOptions
-from g2ard.jobs.inputs import Views, split_views
+from g2ard.jobs.inputs import Numbers, Views, split_views
 from g2ard.jobs.memory import RECOVERY_TIMES
 from g2ard.jobs.run_views import choose_views, find_pool_growth
 from g2ard.jobs.scoring import add_scores
@@ -62,11 +62,11 @@ def distill(
     photos: bool | None = None,
     held_out: Views | None = None,
     beside: str | Path | None = None,
-    up: Sequence[float] | None = None,
+    up: Numbers | None = None,
     size: AtLeastOne | None = None,
     clean: bool = False,
     render_model: RenderModel | None = None,
-    box: Sequence[float] | None = None,
+    box: Numbers | None = None,
     where: str | None = None,
     color: PointColor | None = None,
     format: FormatName = "ply",

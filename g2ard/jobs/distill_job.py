@@ -8,9 +8,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
+from g2ard.arrays import Float
 from g2ard.jobs.budget_search import ResolvedBudget
 from g2ard.jobs.distill_options import LEAST_RECOVERY_SHARE
 from g2ard.jobs.memory import TilePlan
@@ -89,7 +87,7 @@ class DistillJob:
         return list(dict.fromkeys(path for path in paths if path is not None))
 
     @property
-    def weights(self) -> NDArray[np.float64] | None:
+    def weights(self) -> Float | None:
         """(C,) sampling weight per training view, if the views state them."""
         return self.views.train.weights if self.config.select.weighted else None
 

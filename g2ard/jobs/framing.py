@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from g2ard.arrays import Float, Mask
 from g2ard.rendering.renderer import Renderer
 from g2ard.scene.cameras import Camera, Cameras
 from g2ard.scene.samples import take_evenly
@@ -61,7 +61,7 @@ _EMPTY = 0.05
 def choose_fields(
     view: Camera,
     *,
-    subject: NDArray[np.float64] | None = None,
+    subject: Float | None = None,
     scene: Splats | None = None,
     cameras: Cameras | None = None,
 ) -> Fields:
@@ -92,7 +92,7 @@ def _measure_halves(view: Camera) -> tuple[float, float]:
     return float(view.width / view.K[0, 0] / 2), float(view.height / view.K[1, 1] / 2)
 
 
-def _measure_extent(view: Camera, points: NDArray[np.float64]) -> tuple[float, float]:
+def _measure_extent(view: Camera, points: Float) -> tuple[float, float]:
     """Return half the width and height, at distance 1, around most of the points in a view."""
     held = points[view.holds(points)]
     if not len(held):
@@ -106,12 +106,12 @@ def _measure_extent(view: Camera, points: NDArray[np.float64]) -> tuple[float, f
 
 
 def _narrow_windows(
-    halves: NDArray[np.float64],
-    aspects: NDArray[np.float64],
+    halves: Float,
+    aspects: Float,
     view: Camera,
     scene: Splats,
     cameras: Cameras,
-) -> NDArray[np.float64]:
+) -> Float:
     """Return half heights of windows that show little else than what photos saw, at most the given ones."""
     reach = float((halves * np.maximum(1, aspects)).max())
     across, down, seen = _look_around(view, scene, cameras, reach)
@@ -124,9 +124,7 @@ def _narrow_windows(
     return narrowed
 
 
-def _look_around(
-    view: Camera, scene: Splats, cameras: Cameras, reach: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
+def _look_around(view: Camera, scene: Splats, cameras: Cameras, reach: float) -> tuple[Float, Float, Mask]:
     """Look beyond a photo's edges.
 
     Returns:
@@ -153,7 +151,7 @@ def _look_around(
     return np.abs(x), np.abs(y), known | own
 
 
-def _find_seen(renderer: Renderer, photo: Camera, points: NDArray[np.float64]) -> NDArray[np.bool_]:
+def _find_seen(renderer: Renderer, photo: Camera, points: Float) -> Mask:
     """Return which of the (N, 3) points are what a photo shows first."""
     depths = renderer.render(photo, median=True).median
     assert depths is not None

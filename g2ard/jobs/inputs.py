@@ -8,8 +8,8 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from g2ard.arrays import Mask
 from g2ard.config.choices import Axes, RenderModel
 from g2ard.errors import InputError
 from g2ard.io import Source, read_view_set
@@ -32,8 +32,10 @@ from g2ard.scene.transform import up_in
 from g2ard.stages.lift import guessed_axes, lift
 from g2ard.stages.simplify import Pairs, SimplifyConfig
 
+Scene = Splats | str | Path  # a scene, or its path
+Numbers = Sequence[float]  # a vector, direction or box
 Views = Cameras | ViewSet | ViewFiles | str | Path  # cameras, or the path of views
-Split = str | Callable[..., "NDArray[np.bool_]"]  # of `split_mask`, or a function like `for_training`
+Split = str | Callable[..., Mask]  # of `split_mask`, or a function like `for_training`
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +56,7 @@ class GivenViews:
 
     views: Views | None = None
     beside: str | Path | None = None
-    up: Sequence[float] | None = None
+    up: Numbers | None = None
     seed: int = 0
     shape: tuple[int, int] = (800, 600)
     rough: bool = False
@@ -176,19 +178,19 @@ def drop_held_out(train: ViewSet, held_out: Cameras, say: Say = unsaid) -> ViewS
 
 def load_split_views(
     views: Views, split: str, say: Say = unsaid, *, unpictured: bool = False
-) -> tuple[ViewSet, NDArray[np.bool_]]:
+) -> tuple[ViewSet, Mask]:
     """Read all views with their splits, stated or by the rule, and the mask of the views in `split`."""
     found, path = _read_views(views, say, unpictured=unpictured)
     mask = _choose_split(found, path, split)
     return replace(found, splits=splits_of(path, found.cameras.names, found.splits)), mask
 
 
-def _choose_split(views: ViewSet, path: Path | None, split: Split) -> NDArray[np.bool_]:
+def _choose_split(views: ViewSet, path: Path | None, split: Split) -> Mask:
     """Return the mask of the views in a split; a photo of the test split trains under no other name."""
     names = views.cameras.names
     photos = views.cameras.image_paths
     choose = partial(split_mask, which=split) if isinstance(split, str) else split
-    mask: NDArray[np.bool_] = choose(path, names, stated=views.splits)
+    mask: Mask = choose(path, names, stated=views.splits)
     if split != "train" and (split is not for_training or not states_splits(path, views.splits)):
         return mask
     tested = [word == "test" for word in splits_of(path, names, views.splits)]

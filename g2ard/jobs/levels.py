@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Generic, Literal, TypeVar, cast
 
 import numpy as np
-from numpy.typing import NDArray
 
+from g2ard.arrays import Float
 from g2ard.config.checks import AtLeastOne, checks_arguments
 from g2ard.config.choices import BLACK, UNITS, Colour, LengthUnit, RenderModel
 from g2ard.errors import InputError
@@ -26,7 +26,7 @@ from g2ard.jobs.cost import Cost, cost_of, trainer_bytes
 from g2ard.jobs.distill import open_job
 from g2ard.jobs.distill_job import DistillJob
 from g2ard.jobs.distill_options import DistillOptions
-from g2ard.jobs.inputs import GivenViews, Views, load_scene
+from g2ard.jobs.inputs import GivenViews, Numbers, Scene, Views, load_scene
 from g2ard.jobs.viewer_frame import choose_backdrop, choose_frame, up_of
 from g2ard.levels.tileset import TILE_OF_SCENE, Georeference, is_outside, map_system, metres_of
 from g2ard.levels.tileset import save_tileset as write_tileset
@@ -111,7 +111,7 @@ class LevelsJob:
     """
 
     job: DistillJob
-    ratios: Sequence[float]
+    ratios: Numbers
     sky: Splats | None = None
 
     @property
@@ -204,7 +204,7 @@ def open_levels(
     scene: Splats | Source,
     tiling: Tiling | None = None,
     *,
-    ratios: Sequence[float],
+    ratios: Numbers,
     recover: bool,
     steps: int | None,
     background: Colour,
@@ -243,9 +243,9 @@ def open_levels(
 
 @checks_arguments
 def lod(
-    scene: Splats | str | Path,
+    scene: Scene,
     *,
-    ratios: Sequence[float] = RATIOS,
+    ratios: Numbers = RATIOS,
     recover: bool = True,
     views: Views | None = None,
     photos: bool | None = False,
@@ -253,7 +253,7 @@ def lod(
     size: AtLeastOne | None = None,
     background: Colour = BLACK,
     beside: str | Path | None = None,
-    up: Sequence[float] | None = None,
+    up: Numbers | None = None,
     render_model: RenderModel | None = None,
     split_sky: bool = False,
     seed: int = 0,
@@ -320,7 +320,7 @@ def lod(
         return cast("Levels[Splats]", job.run(work))  # not in tiles
 
 
-def check_ratios(ratios: Sequence[float]) -> None:
+def check_ratios(ratios: Numbers) -> None:
     """Reject ratios that do not rise from 1 or more."""
     rising = all(a < b for a, b in pairwise(ratios))
     if not len(ratios) or not rising or not all(1 <= ratio < math.inf for ratio in ratios):
@@ -333,7 +333,7 @@ def save_tileset(
     path: str | Path,
     levels: Sequence[Level],
     *,
-    up: Sequence[float] | None = None,
+    up: Numbers | None = None,
     place: Georeference | str | None = None,
     unit: LengthUnit | None = None,
     cut: Cut | None = None,
@@ -421,9 +421,7 @@ _PROBABLE = 0.1, 20_000.0
 """Least and largest probable extent of a scene on a globe, metres."""
 
 
-def choose_tileset_up(
-    levels: Sequence[Level], up: Sequence[float] | None = None, say: Say = unsaid
-) -> NDArray[np.float64]:
+def choose_tileset_up(levels: Sequence[Level], up: Numbers | None = None, say: Say = unsaid) -> Float:
     """Return the (3,) up direction for 3D Tiles: `up`, z in map coordinates, or an estimate."""
     coarse = levels[-1]
     if up is None and coarse.up is None and coarse.offset.any():

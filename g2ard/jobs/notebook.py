@@ -10,8 +10,8 @@ from tempfile import mkdtemp
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from g2ard.arrays import Bytes, Values
 from g2ard.config.checks import checks_arguments
 from g2ard.config.choices import Colour
 from g2ard.errors import InputError
@@ -20,7 +20,7 @@ from g2ard.io.images import png_bytes, resize
 from g2ard.io.photos import load_photo
 from g2ard.io.reports import Report
 from g2ard.jobs.comparison import is_made_of_points
-from g2ard.jobs.inputs import GivenViews, Views, load_scene
+from g2ard.jobs.inputs import GivenViews, Scene, Views, load_scene
 from g2ard.jobs.viewer_frame import choose_backdrop, choose_frame
 from g2ard.poses import best_views
 from g2ard.progress import Progress, Say, kernel, silent, unsaid
@@ -48,8 +48,8 @@ _FRAME = 640
 
 @checks_arguments
 def view(
-    scene: Splats | HasSplats | str | Path,
-    other: Splats | HasSplats | str | Path | None = None,
+    scene: Scene | HasSplats,
+    other: Scene | HasSplats | None = None,
     *,
     output: str | Path | None = None,
     views: Views | None = None,
@@ -142,20 +142,20 @@ def _draw_picture(shown: Any) -> str:
     return _embed(seen_on_sky(drawn) if lifted else np.clip(drawn.image, 0, 1))
 
 
-def _draw_row(targets: Targets) -> NDArray[np.uint8]:
+def _draw_row(targets: Targets) -> Bytes:
     """Return a few targets in a row, evenly spaced."""
     some = evenly_spaced(len(targets.cameras), _TARGETS)
     names = [targets.cameras.names[view] for view in some]
     return draw_contact_sheet([[_shrink(targets[int(view)]) for view in some]], names)
 
 
-def _shrink(image: NDArray[Any]) -> NDArray[Any]:
+def _shrink(image: Values) -> Values:
     height, width = image.shape[:2]
     share = min(1.0, _TARGET / max(height, width))
     return resize(image, (max(1, round(width * share)), max(1, round(height * share))))
 
 
-def _embed(image: NDArray[Any]) -> str:
+def _embed(image: Values) -> str:
     return f'<img alt="" src="data:image/png;base64,{base64.b64encode(png_bytes(image)).decode()}">'
 
 

@@ -8,14 +8,15 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from g2ard.arrays import Values
 from g2ard.config.checks import AtLeastOne, checks_arguments
 from g2ard.config.choices import Colour, RenderModel
 from g2ard.config.schema import changed, full_paths, keywords
 from g2ard.errors import InputError
 from g2ard.jobs.cost import Cost, cost_of_recovery
-from g2ard.jobs.inputs import GivenViews, Views, load_scene
+from g2ard.jobs.inputs import GivenViews, Scene, Views, load_scene
 from g2ard.jobs.run_views import find_or_plan_views
 from g2ard.jobs.teaching import RunTargets, Teaching, check_teacher, read_views
 from g2ard.pipeline.presets import PRESETS, configure
@@ -46,7 +47,7 @@ class RecoverJob:
     teacher: Splats | None
     targets: RunTargets
     config: RecoverConfig
-    weights: NDArray[Any] | None
+    weights: Values | None
     anchors: Splats | None
     preset: str
     measures: PriorMeasures
@@ -105,12 +106,12 @@ class RecoverJob:
 
 @checks_arguments
 def recover(
-    student: Splats | str | Path,
+    student: Scene,
     targets: Targets | None = None,
     config: RecoverConfig | None = None,
     *,
     views: Views | None = None,
-    teacher: Splats | str | Path | None = None,
+    teacher: Scene | None = None,
     photos: bool = False,
     preset: str = "auto",
     steps: AtLeastOne | None = None,
@@ -123,9 +124,9 @@ def recover(
     weighted: bool | None = None,
     render_model: RenderModel | None = None,
     weights: ArrayLike | None = None,
-    anchors: Anchors | Splats | str | Path | None = None,
+    anchors: Anchors | Scene | None = None,
     validation: Targets | None = None,
-    frozen: NDArray[Any] | None = None,
+    frozen: Values | None = None,
     checkpoint: Path | None = None,
     progress: Progress = silent,
     say: Say = unsaid,
@@ -246,10 +247,10 @@ def _refuse(needed: str, **given: object) -> None:
 
 
 def prepare(
-    student: Splats | str | Path,
+    student: Scene,
     *,
     views: Views | None = None,
-    teacher: Splats | str | Path | None = None,
+    teacher: Scene | None = None,
     photos: bool = False,
     preset: str = "auto",
     settings: Mapping[str, Any] | None = None,
@@ -257,7 +258,7 @@ def prepare(
     size: int | None = None,
     weighted: bool | None = None,
     render_model: RenderModel | None = None,
-    anchors: Splats | str | Path | None = None,
+    anchors: Scene | None = None,
     rough: bool = False,
     progress: Progress = silent,
     say: Say = unsaid,
@@ -312,9 +313,7 @@ def prepare(
     return RecoverJob(start, dense, targets, config, weights, built, why, measures, progress)
 
 
-def _load_anchors(
-    anchors: Splats | str | Path, student: Splats, render_model: RenderModel | None, say: Say
-) -> Splats:
+def _load_anchors(anchors: Scene, student: Splats, render_model: RenderModel | None, say: Say) -> Splats:
     """Return the student as it was built, in its present coordinates."""
     scene = load_scene(anchors, say, render_model)
     if len(scene) != len(student):

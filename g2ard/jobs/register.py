@@ -10,8 +10,9 @@ from pathlib import Path, PurePosixPath
 from typing import Any, TypeVar
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from g2ard.arrays import Float
 from g2ard.config.checks import AboveZero, checks_arguments, signature_of
 from g2ard.config.choices import BLACK, Alpha, Colour, Keep, RenderModel
 from g2ard.errors import InputError, require
@@ -20,7 +21,7 @@ from g2ard.io.detect import file_format
 from g2ard.io.finding import photos_in
 from g2ard.io.photo_headers import has_alpha, have_same_aspect, read_focal, read_size
 from g2ard.io.signs import explained
-from g2ard.jobs.inputs import load_scene
+from g2ard.jobs.inputs import Scene, load_scene
 from g2ard.jobs.trajectory import is_trajectory, read_ace, read_trajectory
 from g2ard.jobs.view_checks import propose_background
 from g2ard.pipeline.presets import configure
@@ -46,13 +47,13 @@ class RegisterJob:
 
     scene: Splats
     photos: Cameras
-    starts: dict[str, NDArray[np.float64]]
+    starts: dict[str, Float]
     pool: Cameras | None
     config: RegisterConfig
     keep: Keep
     background: Colour
     progress: Progress = silent
-    truth: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
+    truth: Mapping[str, Float] = field(default_factory=dict)
 
     def run(self) -> Registered:
         """Find the poses, and compare them with the true ones."""
@@ -81,7 +82,7 @@ class RegisterJob:
 
 @checks_arguments
 def prepare(
-    scene: Splats | str | Path,
+    scene: Scene,
     photos: Cameras | str | Path,
     *,
     poses: Poses | str | Path | None = None,
@@ -175,7 +176,7 @@ def register(*inputs: Any, **options: Any) -> Registered:
     return prepare(*inputs, **options).run()
 
 
-def _named(given: Poses | str | Path, names: Sequence[str]) -> dict[str, NDArray[np.float64]]:
+def _named(given: Poses | str | Path, names: Sequence[str]) -> dict[str, Float]:
     if isinstance(given, str | Path):
         return poses_for(Path(given), names)
     return {name: np.asarray(pose, np.float64) for name, pose in given.items()}
@@ -328,7 +329,7 @@ def _suits(file: Path, size: tuple[int, int], like: tuple[int, int]) -> bool:
 
 
 @explained
-def read_poses(path: Path) -> dict[str, NDArray[np.float64]]:
+def read_poses(path: Path) -> dict[str, Float]:
     """Read name → (4, 4) camera_from_world from views in any format, or from ACE's text (`read_ace`)."""
     if path.suffix.lower() == ".txt" and path.is_file():
         return read_ace(path)
@@ -336,7 +337,7 @@ def read_poses(path: Path) -> dict[str, NDArray[np.float64]]:
     return dict(zip(cameras.names, cameras.viewmats, strict=True))
 
 
-def poses_for(path: Path, names: Sequence[str]) -> dict[str, NDArray[np.float64]]:
+def poses_for(path: Path, names: Sequence[str]) -> dict[str, Float]:
     """Read the poses of the named photos, see `read_poses` and `matched`, or those of a trajectory."""
     if is_trajectory(path):
         return read_trajectory(path, names)

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from g2ard.arrays import Float
 from g2ard.config.checks import AtLeastOne, checks_arguments
 from g2ard.errors import InputError
 from g2ard.io.detect import run_views
@@ -320,7 +320,7 @@ def _add_other_kinds(
     size: int | None,
     share: float = 1.0,
     learns: bool = True,
-    weigh: Callable[[], NDArray[np.float64] | None] | None = None,
+    weigh: Callable[[], Float | None] | None = None,
 ) -> _Mixed:
     """Add views of other kinds to training views: those that `complete` chooses, or of one kind with a focus.
 

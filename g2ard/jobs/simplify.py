@@ -8,9 +8,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-from numpy.typing import NDArray
-
+from g2ard.arrays import Int
 from g2ard.config.checks import check_seed, checks_arguments
 from g2ard.config.choices import FormatName, PointColor, RenderModel
 from g2ard.errors import InputError
@@ -28,7 +26,7 @@ from g2ard.jobs.budget_search import (
     pass_through_file,
 )
 from g2ard.jobs.chosen_points import PointChoice
-from g2ard.jobs.inputs import GivenViews, Views, lift_cloud, load_scene, say_regions
+from g2ard.jobs.inputs import GivenViews, Numbers, Scene, Views, lift_cloud, load_scene, say_regions
 from g2ard.pipeline.dense import Dense, InMemory, Merged, load_whole
 from g2ard.pipeline.presets import configure
 from g2ard.progress import Progress, Say, plural, silent, unsaid
@@ -241,7 +239,7 @@ class Reduction:
         )
 
 
-def read_parents(small: Merged, source: Source) -> NDArray[np.int64]:
+def read_parents(small: Merged, source: Source) -> Int:
     """Return the (N,) new row of each row of a scene, in its file's order; −1 if it was dropped."""
     if isinstance(small, Simplified):
         return small.parents
@@ -297,7 +295,7 @@ def open_reduction(
 
 @checks_arguments
 def simplify(
-    scene: Splats | str | Path,
+    scene: Scene,
     *,
     count: int | str | None = None,
     ratio: float | None = None,
@@ -308,13 +306,13 @@ def simplify(
     views: Views | None = None,
     blind: bool = False,
     method: str | None = None,
-    keep_region: Sequence[Sequence[float]] | None = None,
+    keep_region: Sequence[Numbers] | None = None,
     config: SimplifyConfig | None = None,
     settings: Mapping[str, Any] | None = None,
     beside: str | Path | None = None,
-    up: Sequence[float] | None = None,
+    up: Numbers | None = None,
     render_model: RenderModel | None = None,
-    box: Sequence[float] | None = None,
+    box: Numbers | None = None,
     where: str | None = None,
     color: PointColor | None = None,
     seed: int = 0,

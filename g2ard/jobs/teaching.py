@@ -5,12 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 
 from g2ard.config.choices import Colour, is_made
 from g2ard.errors import InputError
 from g2ard.io.exposures import find_exposures
-from g2ard.jobs.inputs import Views, drop_unscorable, load_split_views
+from g2ard.jobs.inputs import Scene, Views, drop_unscorable, load_split_views
 from g2ard.jobs.run_views import limit_pixels
 from g2ard.jobs.view_checks import check_photos, propose_background, warn_of_sight
 from g2ard.pipeline.distill import RunViews
@@ -22,7 +21,7 @@ from g2ard.scene.splats import Splats
 from g2ard.system.cached import cached_property
 
 
-def check_teacher(views: Views | None, teacher: Splats | str | Path | None) -> None:
+def check_teacher(views: Views | None, teacher: Scene | None) -> None:
     """Check that there is something to train on or score against: photos of views, or a teacher."""
     if teacher is None and is_made(views):
         raise InputError("generated views have no photos", parameter="views", hint="give {teacher=SCENE}")

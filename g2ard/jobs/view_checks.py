@@ -3,8 +3,8 @@
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from g2ard.arrays import Float, Values
 from g2ard.config.choices import Colour, colour_text, is_made
 from g2ard.errors import InputError
 from g2ard.io import find_views, read_view_set
@@ -169,7 +169,7 @@ def _compare_photos(splats: Splats, targets: Photos, background: Colour) -> tupl
     return own, beaten
 
 
-def _correlate(image: NDArray[np.floating], photo: NDArray[np.floating]) -> float:
+def _correlate(image: Values, photo: Values) -> float:
     """Return the correlation of (N,) values."""
     centred = [values - values.mean() for values in (image, photo)]
     scale = np.linalg.norm(centred[0]) * np.linalg.norm(centred[1])
@@ -211,7 +211,7 @@ def size_like_pool(cameras: Cameras) -> Cameras:
     return cameras if any(cameras.image_paths) else cameras.resized(_VIEW_SIDE)
 
 
-def sample_opaque_points(splats: Splats) -> NDArray[np.float64]:
+def sample_opaque_points(splats: Splats) -> Float:
     """Return (K, 3) world means of a sample of the Gaussians of opacity 0.5 or more, otherwise of all."""
     opaque = np.flatnonzero(splats.opacities >= 0.5)
     rows = opaque if len(opaque) else np.arange(len(splats))

@@ -6,13 +6,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from g2ard.arrays import Float
 from g2ard.config.checks import checks_arguments
 from g2ard.config.choices import BLACK, Axes, Colour
 from g2ard.errors import InputError
 from g2ard.jobs.framing import Fields, choose_fields
-from g2ard.jobs.inputs import GivenViews, load_views
+from g2ard.jobs.inputs import GivenViews, Numbers, load_views
 from g2ard.jobs.view_checks import sample_opaque_points, take_or_find_views
 from g2ard.poses import best_views
 from g2ard.poses.site import Site
@@ -50,13 +50,13 @@ class ViewerFrame:
         name: name of the view used as initial camera.
     """
 
-    rotation: NDArray[np.float64]
-    origin: NDArray[np.float64]
+    rotation: Float
+    origin: Float
     start: Start | None = None
     name: str | None = None
 
     @property
-    def up(self) -> NDArray[np.float64]:
+    def up(self) -> Float:
         """Up direction, (3,) unit vector in world coordinates."""
         return -self.rotation[1]
 
@@ -66,19 +66,19 @@ class ViewerFrame:
         turn[:3, :3] = self.rotation
         return transform(replace(splats.recentred(self.origin), offset=np.zeros(3), axes="RDF"), turn)
 
-    def place(self, offset: NDArray[np.float64], axes: Axes = "RDF") -> tuple[list[float], list[float]]:
+    def place(self, offset: Float, axes: Axes = "RDF") -> tuple[list[float], list[float]]:
         """Return quaternion x y z w and translation that put the files of a scene with this offset and these
         axes where `of` and the viewer put it."""
         turn = _TO_VIEWER @ self.rotation
         w, *xyz = quaternion_of(turn @ change_of_axes("RDF", axes)).tolist()
         return [*xyz, w], (turn @ (offset - self.origin)).tolist()
 
-    def world(self, point: Sequence[float]) -> NDArray[np.float64]:
+    def world(self, point: Numbers) -> Float:
         """Return world coordinates of a point in the viewer's axes."""
-        back: NDArray[np.float64] = self.rotation.T @ _TO_VIEWER @ np.asarray(point) + self.origin
+        back: Float = self.rotation.T @ _TO_VIEWER @ np.asarray(point) + self.origin
         return back
 
-    def start_at(self, view: Camera, points: NDArray[np.float64], fields: Fields | None = None) -> Start:
+    def start_at(self, view: Camera, points: Float, fields: Fields | None = None) -> Start:
         """Convert a view for the viewer, without roll; it orbits the median depth of the points in view.
 
         Without `fields`, all of the view fits into the window.
@@ -90,7 +90,7 @@ class ViewerFrame:
         depth = float(np.median(np.abs((held - view.position) @ ahead)))
         to_viewer = _TO_VIEWER @ self.rotation
 
-        def there(point: NDArray[np.float64]) -> tuple[float, float, float]:
+        def there(point: Float) -> tuple[float, float, float]:
             x, y, z = (float(v) for v in to_viewer @ (point - self.origin))
             return x, y, z
 
@@ -119,7 +119,7 @@ def choose_frame(scene: Splats, given: GivenViews, start: str | None = None) -> 
 
 
 def place_frame(
-    scene: Splats, cameras: Cameras | None, up: Sequence[float] | None = None, *, start: str | None = None
+    scene: Splats, cameras: Cameras | None, up: Numbers | None = None, *, start: str | None = None
 ) -> ViewerFrame:
     """Choose a frame and an initial camera, from given cameras if there are any, like `choose_frame`.
 
@@ -160,13 +160,13 @@ def choose_backdrop(
     return None if any(measure_prior(sample).is_lift for sample in samples) else BLACK
 
 
-def find_shared_up(cameras: Cameras) -> NDArray[np.float64] | None:
+def find_shared_up(cameras: Cameras) -> Float | None:
     """Return the up direction that views share, or that of photos which all face one way; otherwise None."""
     across = cameras.viewmats[:, 0, :3]
     up = -cameras.viewmats[:, 1, :3].mean(axis=0)
     values, vectors = np.linalg.eigh(across.T @ across / len(cameras))
     if values[0] <= _LEVEL_SPREAD_RATIO * values[1] and values[1] > _ONE_WAY_SPREAD:
-        axis: NDArray[np.float64] = vectors[:, 0]
+        axis: Float = vectors[:, 0]
         above = up - cameras.forwards.mean(axis=0) / 2  # most cameras look down, some straight down
         return axis if axis @ above >= 0 else -axis
     return unit_up(up) if any(cameras.image_paths) and np.linalg.norm(up) > _UPRIGHT_MEAN else None
@@ -178,7 +178,7 @@ def read_stated_up(scene: Splats) -> tuple[float, float, float] | None:
 
 
 @checks_arguments
-def up_of(scene: Splats, up: Sequence[float] | None = None) -> NDArray[np.float64]:
+def up_of(scene: Splats, up: Numbers | None = None) -> Float:
     """Return a scene's up direction.
 
     Args:
@@ -206,7 +206,7 @@ def up_of(scene: Splats, up: Sequence[float] | None = None) -> NDArray[np.float6
         return np.array([0.0, -1.0, 0.0])
 
 
-def _rotate_upright(up: NDArray[np.float64]) -> NDArray[np.float64]:
+def _rotate_upright(up: Float) -> Float:
     """Return the smallest rotation (3, 3) from `up` to −y: I + K + K²/(1 + c).
 
     K is the cross product matrix of up × −y, c the cosine.
@@ -220,5 +220,5 @@ def _rotate_upright(up: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.eye(3) + k + k @ k / (1 + c)
 
 
-def _find_middle(scene: Splats) -> NDArray[np.float64]:
+def _find_middle(scene: Splats) -> Float:
     return np.median(sample_opaque_points(scene), axis=0)

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from g2ard.arrays import Float, Float32
 from g2ard.config.checks import AtLeastOne, NotNegative, Within, checks_arguments
 from g2ard.config.choices import AdaptSchedule
 from g2ard.errors import InputError
@@ -58,8 +58,8 @@ class ColourChange:
         gain: gain in dB on the pixels it was fitted to.
     """
 
-    matrix: NDArray[np.float64]
-    shift: NDArray[np.float64]
+    matrix: Float
+    shift: Float
     gain: float
 
 
@@ -109,7 +109,7 @@ def recolour(splats: Splats, change: ColourChange) -> Splats:
     return replace(splats, sh0=base, shN=splats.shN @ matrix.T)
 
 
-def count_views_seeing(splats: Splats, cameras: Cameras) -> NDArray[np.float64]:
+def count_views_seeing(splats: Splats, cameras: Cameras) -> Float:
     """Return (N,) the number of views that see each Gaussian; each counts w/(w + 10), w = Σ αT in a small
     render."""
     small = cameras.resized(_VISIBILITY_SIDE)
@@ -120,11 +120,11 @@ def count_views_seeing(splats: Splats, cameras: Cameras) -> NDArray[np.float64]:
     return out
 
 
-def blend_appearance(start: Splats, fitted: Splats, share: NDArray[np.float64]) -> Splats:
+def blend_appearance(start: Splats, fitted: Splats, share: Float) -> Splats:
     """Interpolate colours and opacity logits from `start` to `fitted` by the (N,) `share`."""
     s = share.astype(np.float32)
 
-    def between(a: NDArray[np.float32], b: NDArray[np.float32]) -> NDArray[np.float32]:
+    def between(a: Float32, b: Float32) -> Float32:
         return a + s.reshape(-1, *[1] * (a.ndim - 1)) * (b - a)
 
     return replace(

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, Protocol
+from typing import ClassVar, Protocol
 
-import numpy as np
-from numpy.typing import NDArray
-
+from g2ard.arrays import Mask, Values
 from g2ard.config.choices import BLACK, Colour
 from g2ard.errors import InputError
 from g2ard.io.stream import PartsStream
@@ -30,7 +28,7 @@ class Merged(Protocol):
     @property
     def splats(self) -> Splats | PartsStream: ...
     @property
-    def protected(self) -> NDArray[np.bool_] | None: ...
+    def protected(self) -> Mask | None: ...
     @property
     def report(self) -> SimplifyReport: ...
 
@@ -60,7 +58,7 @@ class Dense(Protocol):
         views: Cameras | None,
         config: SimplifyConfig,
         *,
-        protected: NDArray[np.bool_] | None = None,
+        protected: Mask | None = None,
         final_budget: int | None = None,
         gaps: bool = False,
         progress: Progress = silent,
@@ -109,7 +107,7 @@ class InMemory:
         views: Cameras | None,
         config: SimplifyConfig,
         *,
-        protected: NDArray[np.bool_] | None = None,
+        protected: Mask | None = None,
         final_budget: int | None = None,
         gaps: bool = False,
         progress: Progress = silent,
@@ -148,7 +146,7 @@ class _Remembering:
     def __init__(self, source: VisibilitySource, views: Cameras) -> None:
         self.source = source
         self.views = views
-        self.first: tuple[list[NDArray[Any]], SampledVisibility] | None = None
+        self.first: tuple[list[Values], SampledVisibility] | None = None
 
     def __call__(self, scene: Splats) -> SampledVisibility:
         # Scales are clamped anew by each reduction; a kept scene would keep its prepared copy, too.

@@ -9,8 +9,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from g2ard.arrays import Float, Mask, Values
 from g2ard.config.checks import checks_arguments
 from g2ard.io.types import ViewSet
 from g2ard.pipeline.config import DistillConfig, SelectConfig
@@ -233,8 +234,8 @@ def plan_round_counts(dense: Dense, budget: int, config: DistillConfig) -> list[
 
 
 def select_views(
-    scene: Splats, cameras: Cameras, config: DistillConfig, given: NDArray[Any] | None, progress: Progress
-) -> tuple[NDArray[Any] | None, NDArray[Any] | None, ViewsReport | None]:
+    scene: Splats, cameras: Cameras, config: DistillConfig, given: Values | None, progress: Progress
+) -> tuple[Values | None, Values | None, ViewsReport | None]:
     """Select the views that see `scene`; return their rows, None for all, their weights and a report.
 
     Given weights override those of the selection.
@@ -268,7 +269,7 @@ def select_views(
 
 def choose_draw_weights(
     scene: Splats, train: ViewSet, config: DistillConfig, progress: Progress = silent
-) -> NDArray[np.float64] | None:
+) -> Float | None:
     """Return the weights by which all training views are drawn, as stated or selected; 0 is never drawn.
 
     None draws them equally often.
@@ -290,10 +291,10 @@ def _simplify_round(
     budget: int,
     cameras: Cameras,
     config: DistillConfig,
-    protected: NDArray[np.bool_] | None,
+    protected: Mask | None,
     progress: Progress,
     drawn: Sequence[Targets | None],
-) -> tuple[Splats, SimplifyReport, NDArray[np.bool_]]:
+) -> tuple[Splats, SimplifyReport, Mask]:
     """Simplify to the count of a round; return the scene, a report and the flags for the next round.
 
     Args:

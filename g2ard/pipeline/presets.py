@@ -7,12 +7,13 @@ from dataclasses import is_dataclass
 from typing import Any, TypeVar
 
 from g2ard.config.checks import checks_arguments
+from g2ard.config.choices import Named
 from g2ard.config.schema import changed, full_paths
 from g2ard.errors import InputError, require
 
 Config = TypeVar("Config")
 
-_PAPER: dict[str, Any] = {
+_PAPER: Named = {
     "select.policy": "directional",
     "select.views_count": 0.5,
     "select.weighted": False,
@@ -25,7 +26,7 @@ _PAPER: dict[str, Any] = {
     "adapt.sh_degree": 3,
 }
 
-PRESETS: dict[str, dict[str, Any]] = {
+PRESETS: dict[str, Named] = {
     "auto": {},
     **{kind: {"recover.regularizers": kind} for kind in ("trained", "lift", "noisy")},
     **{

@@ -8,8 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeVar
 
-from numpy.typing import NDArray
-
+from g2ard.arrays import Values
 from g2ard.progress import Progress, silent
 from g2ard.rendering.targets import Targets, fill, fingerprint_of
 from g2ard.scene.splats import ARRAYS, Splats
@@ -22,7 +21,7 @@ from g2ard.stages.simplify.reduce import SimplifyReport
 from g2ard.system.keys import key_of
 
 R = TypeVar("R", RecoverReport, SimplifyReport)
-_Result = tuple[Splats, R, dict[str, NDArray[Any]]]
+_Result = tuple[Splats, R, dict[str, Values]]
 _WITHIN = ".checkpoint.npz"
 
 
@@ -81,7 +80,7 @@ class Steps:
         config: RecoverConfig,
         *,
         built: Splats | None = None,
-        weights: NDArray[Any] | None = None,
+        weights: Values | None = None,
         validation: Targets | None = None,
         filled: bool = True,
         **options: Any,

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from g2ard.arrays import Float32, Mask, Values
 from g2ard.config.choices import BLACK, Colour
 from g2ard.io.stream import PartsStream
 from g2ard.io.tile_store import TileStore
@@ -97,7 +97,7 @@ class InTiles:
         views: Cameras | None,
         config: SimplifyConfig,
         *,
-        protected: NDArray[np.bool_] | None = None,
+        protected: Mask | None = None,
         final_budget: int | None = None,
         gaps: bool = False,
         progress: Progress = silent,
@@ -124,7 +124,7 @@ class InTiles:
         chosen = seen_by(views)
         drawn = TileRenders(self, chosen, opacity=True)
 
-        def shown(view: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        def shown(view: int) -> tuple[Float32, Float32]:
             image = drawn[view]
             return image[..., :3], image[..., 3]
 
@@ -232,12 +232,12 @@ class TileRenders(Cached):
         for chunk, path in zip(chunks, files, strict=True):
             self._files |= dict.fromkeys(chunk, path)
 
-    def _make(self, view: int) -> NDArray[Any]:
+    def _make(self, view: int) -> Values:
         if view not in self._files:
             self.fill(self._scene.workers.progress)
         (image,) = load(self._files[view], str(view))
         return image
 
-    def __getitem__(self, view: int) -> NDArray[np.float32]:
+    def __getitem__(self, view: int) -> Float32:
         image = self._stored(view)
         return image if self._opacity else unrounded(image)

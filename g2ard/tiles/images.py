@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from g2ard.arrays import Float32, Values
 from g2ard.io.tile_store import TileStore
 from g2ard.rendering.boxes import FAINT, Canvas, front_to_back, reaching
 from g2ard.rendering.renderer import RasterSettings, Renderer
@@ -76,7 +75,7 @@ def draw(given: Given) -> Arrays:
     return {str(n): _stored(image, given["opacity"]) for n, image in zip(numbers, finished, strict=True)}
 
 
-def _stored(drawn: NDArray[np.float32], opacity: bool) -> NDArray[Any]:
+def _stored(drawn: Float32, opacity: bool) -> Values:
     return drawn if opacity else rounded(np.clip(drawn[..., :3], 0, 1))
 
 

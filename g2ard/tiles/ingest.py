@@ -7,10 +7,9 @@ from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
 from shutil import rmtree
-from typing import Any
 
 from g2ard.config.checks import checks_arguments
-from g2ard.config.choices import RenderModel
+from g2ard.config.choices import Named, RenderModel
 from g2ard.errors import InputError, OutputError, require
 from g2ard.io.atomic import drop_empty, drop_temporaries, parents_made
 from g2ard.io.detect import MANIFEST, PARTS
@@ -101,7 +100,7 @@ def ingest(
             path=stream.path,
             parameter="tile_rows",
         )
-    settings: dict[str, Any] = {"tile_rows": tile_rows}
+    settings: Named = {"tile_rows": tile_rows}
     lift = lift or LiftConfig()
     if not isinstance(stream, SceneStream):
         settings["lift"] = asdict(lift)
@@ -156,10 +155,10 @@ def ingest(
 def _manifest(
     stream: SceneStream | PointStream,
     sources: list[str],
-    settings: dict[str, Any],
+    settings: Named,
     notes: list[Note],
     progress: Progress,
-) -> dict[str, Any]:
+) -> Named:
     """Describe what the tiles hold."""
     scene = stream if isinstance(stream, SceneStream) else None
     manifest = {
@@ -221,7 +220,7 @@ def _made(folder: Path) -> list[Path]:
     return made
 
 
-def _check_tiles(folder: Path, key: str, settings: dict[str, Any], overwrite: bool, say: Say) -> None:
+def _check_tiles(folder: Path, key: str, settings: Named, overwrite: bool, say: Say) -> None:
     """Reject tiles of another scene or other settings, unless they are replaced."""
     known = _key_in(folder / MANIFEST)
     if known not in (None, key) and not overwrite:
@@ -234,10 +233,10 @@ def _check_tiles(folder: Path, key: str, settings: dict[str, Any], overwrite: bo
         say(f"{folder}: {MANIFEST} is damaged; writing all tiles again")
 
 
-def _differing(manifest: Path, settings: dict[str, Any]) -> str:
+def _differing(manifest: Path, settings: Named) -> str:
     """Return the settings that differ from a manifest's, in brackets, or ""."""
     with suppress(InputError, LookupError):
-        theirs = checked(read_json(manifest)["settings"], dict[str, Any], Place(manifest))
+        theirs = checked(read_json(manifest)["settings"], Named, Place(manifest))
         names = [name for name in {**theirs, **settings} if theirs.get(name) != settings.get(name)]
         differing = [f"{name} {theirs.get(name)} instead of {settings.get(name)}" for name in names]
         return f" ({'; '.join(differing)})" if differing else ""

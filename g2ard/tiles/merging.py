@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from g2ard.arrays import Float32, Int, Mask, Values
 from g2ard.errors import InputError
 from g2ard.io.sanitize import BLOCK
 from g2ard.io.stream import PartsStream, SceneStream
@@ -44,12 +44,12 @@ class Merged:
     files: Sequence[Path]
 
     @property
-    def protected(self) -> NDArray[np.bool_] | None:
+    def protected(self) -> Mask | None:
         """(M,) protection flags, if the method has them."""
         flags = [load(path, "protected")[0] for path in self.files if path.name.startswith("reduce")]
         return np.concatenate(flags) if flags else None
 
-    def parents(self, scene: SceneStream) -> NDArray[np.int64]:
+    def parents(self, scene: SceneStream) -> Int:
         """Return (N,) the row in the result of each Gaussian, see `Simplified`.
 
         Args:
@@ -260,7 +260,7 @@ def _runs(run: TiledRun, costs: list[Path], budget: int) -> tuple[list[int], lis
     return [n - c for n, c in zip(kept, closed, strict=True)], [0] * len(kept)
 
 
-def _costs_of(path: Path) -> Callable[[], NDArray[np.float32]]:
+def _costs_of(path: Path) -> Callable[[], Float32]:
     return lambda: load(path, "costs")[0]
 
 
@@ -272,7 +272,7 @@ def _unreached(count: int, budget: int, tiles: int, why: str) -> InputError:
     )
 
 
-def cheapest(costs: Sequence[Callable[[], NDArray[np.float32]]], count: int) -> list[int]:
+def cheapest(costs: Sequence[Callable[[], Float32]], count: int) -> list[int]:
     """Return how many of the `count` smallest costs lie in each array; ties go to earlier ones.
 
     Non-negative floats sort like their bits. Two histograms, of the upper and lower 16 bits, find the
@@ -304,15 +304,15 @@ def cheapest(costs: Sequence[Callable[[], NDArray[np.float32]]], count: int) -> 
     return counts
 
 
-def _bits(make: Callable[[], NDArray[np.float32]]) -> NDArray[np.uint32]:
+def _bits(make: Callable[[], Float32]) -> Values:
     return np.ascontiguousarray(make(), np.float32).view(np.uint32)
 
 
-def _histogram(values: NDArray[Any]) -> NDArray[np.int64]:
+def _histogram(values: Values) -> Int:
     return np.bincount(values, minlength=_HALF)
 
 
-def _rank(histogram: NDArray[np.int64], count: int) -> tuple[int, int]:
+def _rank(histogram: Int, count: int) -> tuple[int, int]:
     """Return the bin of the count-th value, and the number of values in earlier bins."""
     sums = np.cumsum(histogram)
     at = min(int(np.searchsorted(sums, count)), len(sums) - 1)

@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 import g2ard._core as _core
+from g2ard.arrays import Float, Rows
 from g2ard.rendering.visibility import LONGEST, MOST_VIEWS, NEAR, usual_and_others, weight_of_others
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.samples import evenly_spaced, weighted_quantile
@@ -70,7 +70,7 @@ class Sights:
         )
         return self.run.each(merged_visibility, "merged visibility", inputs)
 
-    def _light(self, boxes: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _light(self, boxes: Float) -> Float:
         """Return (V, T) Σ αT² of each tile's coarse Gaussians in each view."""
         store = self.run.store
         here = self.cameras.recentred(store.offset)
@@ -84,7 +84,7 @@ class Sights:
         files = self.run.workers.map(light, "light", calls, {})
         return np.concatenate([load(path, "weights")[0] for path in files])
 
-    def _chosen(self, light: NDArray[np.float64], tile: int) -> dict[str, Any]:
+    def _chosen(self, light: Float, tile: int) -> dict[str, Any]:
         """Choose the views of a tile, evenly spaced among those that see it."""
         usual = light[: self.usual]
         others = light[self.usual :]
@@ -99,7 +99,7 @@ class Sights:
         }
 
 
-def levels_of(boxes: NDArray[np.float64], tile: int) -> list[str | None]:
+def levels_of(boxes: Float, tile: int) -> list[str | None]:
     """Return the coarse level of every tile in views of `tile`, None for itself."""
     low = boxes[:, 0]
     high = boxes[:, 1]
@@ -110,14 +110,14 @@ def levels_of(boxes: NDArray[np.float64], tile: int) -> list[str | None]:
     return levels
 
 
-def boxes_of(coarse: Sequence[Path]) -> NDArray[np.float64]:
+def boxes_of(coarse: Sequence[Path]) -> Float:
     """Return the (T, 2, 3) low and high corners of tiles."""
     return np.array(
         [np.percentile(scene_of(path, "near").means, _BOX_PERCENTILES, axis=0) for path in coarse]
     )
 
 
-def in_sight(light: NDArray[np.float64], tile: int) -> NDArray[np.intp]:
+def in_sight(light: Float, tile: int) -> Rows:
     """Return the views that see a tile; if they are few, include the best of the others."""
     own = light[:, tile]
     sight = np.flatnonzero(own > _LEAST_LIGHT_SHARE * light.sum(axis=1))

@@ -21,9 +21,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 import g2ard._core as _core
+from g2ard.arrays import Float32, Values
 from g2ard.io.tile_store import TileStore
 from g2ard.rendering.renderer import RasterSettings, view_of
 from g2ard.rendering.visibility import NEAR, SampledVisibility, add_until_converged
@@ -176,7 +176,7 @@ def _add_until_converged(
     return [view for views in add_until_converged(add, len(cameras), rows) for view in views]
 
 
-def _median(values: NDArray[np.float32]) -> float:
+def _median(values: Float32) -> float:
     """Return the upper median, NaN without values."""
     middle = len(values) // 2
     return float(np.partition(values, middle)[middle]) if len(values) else math.nan
@@ -273,9 +273,7 @@ def reduce(given: Given) -> Arrays:
     return made | {"protected": done.protected}
 
 
-def _merged(
-    scene: PreparedScene, small: Splats, parents: NDArray[np.int32], clamped: int, given: Given
-) -> Arrays:
+def _merged(scene: PreparedScene, small: Splats, parents: Values, clamped: int, given: Given) -> Arrays:
     """Return what `merge` returns; sums do not depend on the order of the tile's rows."""
     of = parents[scene.core.order]
     kept = of >= 0
@@ -308,15 +306,13 @@ def merged_visibility(given: Given) -> Arrays:
 
 def _of_others(
     own: PreparedScene, amid: PreparedScene, cameras: Cameras, settings: RasterSettings, given: Given
-) -> NDArray[np.float32]:
+) -> Float32:
     """Return the weighted Σ αT² of a tile's Gaussians over views of other kinds."""
     weight = np.float32(given["others_weight"])
     return weight * _sum_of(own, amid, cameras.take(given["others"]), settings)
 
 
-def _sum_of(
-    own: PreparedScene, amid: PreparedScene, cameras: Cameras, settings: RasterSettings
-) -> NDArray[np.float32]:
+def _sum_of(own: PreparedScene, amid: PreparedScene, cameras: Cameras, settings: RasterSettings) -> Float32:
     """Return Σ αT² of a tile's Gaussians, the first ones of `amid`, over views."""
     if not len(cameras):
         return np.zeros(len(own), np.float32)

@@ -15,8 +15,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from g2ard.arrays import Values
 from g2ard.errors import InputError
 from g2ard.io.atomic import atomic_output
 from g2ard.io.tile_store import TileStore
@@ -27,7 +27,7 @@ from g2ard.scene.splats import Splats
 from g2ard.scene.transform import join
 from g2ard.system.keys import UNKEYED, key_of
 
-Arrays = dict[str, NDArray[Any]]
+Arrays = dict[str, Values]
 """Output of a task: arrays by name, stored as one .npz file."""
 
 Given = Mapping[str, Any]
@@ -171,7 +171,7 @@ def is_whole(path: Path) -> bool:
         return False
 
 
-def load(path: Path, *names: str) -> list[NDArray[Any]]:
+def load(path: Path, *names: str) -> list[Values]:
     """Read arrays of a task's file."""
     try:
         with np.load(path, allow_pickle=False) as arrays:

@@ -18,9 +18,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from g2ard.arrays import Float32
+from g2ard.arrays import Float32, Int, Values
+from g2ard.config.choices import Named
 from g2ard.errors import OutputError
 from g2ard.io.atomic import atomic_output, drop_temporaries
 from g2ard.io.detect import MANIFEST, PARTS
@@ -81,7 +81,7 @@ def clear(folder: Path, key: str | None = None, *, complete: bool = False) -> No
             path.unlink()
 
 
-def _read_begun(parts: Path) -> dict[str, Any]:
+def _read_begun(parts: Path) -> Named:
     """Return what is known of begun tiles: their key, and the file of their tree."""
     return dict(read_json(parts / MANIFEST)) if (parts / MANIFEST).is_file() else {}
 
@@ -117,7 +117,7 @@ class Pouring:
         if _read_begun(self.parts).get("key") != self.key:
             self._begin({"key": self.key})
 
-    def _begin(self, known: dict[str, Any]) -> None:
+    def _begin(self, known: Named) -> None:
         with atomic_output(self.parts / MANIFEST, overwrite=True) as temporary:
             temporary.write_text(json.dumps(known), encoding="ascii")
 
@@ -249,7 +249,7 @@ class Pouring:
         ]
         return self.workers.map(function, stage, calls, {"folder": self.folder})
 
-    def gather(self, tree: Path, files: Sequence[Path]) -> list[dict[str, Any]]:
+    def gather(self, tree: Path, files: Sequence[Path]) -> list[Named]:
         """Write the rows of each tile and of its halo; return the manifest's entries."""
         some = None if self.mended is None else self.mended[1]
         written = self._run_each(gathered, "write", some, files, {})
@@ -264,7 +264,7 @@ class Pouring:
             tiles.append({"rows": rows, "halo": halo, "low": corners[0], "high": corners[1], "crc32": checks})
         return tiles
 
-    def finish(self, tree: Path, tiles: list[dict[str, Any]], manifest: dict[str, Any]) -> None:
+    def finish(self, tree: Path, tiles: list[Named], manifest: Named) -> None:
         """Write the manifest, which makes the folder a store, and drop the steps."""
         cells, margin = _load_tree(tree)
         content = {
@@ -316,21 +316,21 @@ def _load_tree(path: Path) -> tuple[KdTree, float]:
     return KdTree.from_json(json.loads(str(cells))), float(margin)
 
 
-def _count_rows(files: Sequence[Path]) -> NDArray[np.int64]:
+def _count_rows(files: Sequence[Path]) -> Int:
     """Return the (files, tiles, 2) numbers of rows of each tile, and of its halo, in each file."""
     return np.array([load(path, "counts")[0] for path in files])
 
 
-def _select(files: Sequence[Path], counts: NDArray[np.int64]) -> list[Path]:
+def _select(files: Sequence[Path], counts: Int) -> list[Path]:
     return [path for path, count in zip(files, counts, strict=True) if count]
 
 
-def _get_positions(rows: NDArray[Any]) -> Float32:
+def _get_positions(rows: Values) -> Float32:
     """Return the (n, 3) float32 positions with which rows begin."""
     return np.ascontiguousarray(rows["near"] if rows.dtype.names else rows[:, :3])
 
 
-def _load_rows(files: Sequence[Path], name: str) -> NDArray[Any]:
+def _load_rows(files: Sequence[Path], name: str) -> Values:
     return np.concatenate([load(path, name)[0] for path in files])
 
 
@@ -359,7 +359,7 @@ def cut(given: Given) -> Arrays:
         What `_route` returns; `tallies`, the counts of each source.
     """
     stream = given["stream"]
-    blocks = list[NDArray[Any]]()
+    blocks = list[Values]()
     for block in stream.part("blocks", *given["part"]):
         if isinstance(stream, PointStream):
             far, colors = block
@@ -373,7 +373,7 @@ def cut(given: Given) -> Arrays:
     return {**_route(rows, given), "tallies": tallies}
 
 
-def _route(rows: NDArray[Any], given: Given) -> Arrays:
+def _route(rows: Values, given: Given) -> Arrays:
     """Return the rows of each tile and of its halo, called by the names of its files, if there are any.
 
     `counts`, (tiles, 2), has their numbers.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any, Literal, cast
+from typing import Annotated, Literal, cast
 
 import typer
 
@@ -13,7 +13,7 @@ from g2ard.cli.fields import ShDegreeOption
 from g2ard.cli.options import numbers
 from g2ard.cli.run import Run
 from g2ard.cli.run_result import say_weight
-from g2ard.config.choices import NAMED_AXES, Axes, AxesName, PlyLayout, PointColor
+from g2ard.config.choices import NAMED_AXES, Axes, AxesName, Named, PlyLayout, PointColor
 from g2ard.errors import InputError, OutputError
 from g2ard.io import Source
 from g2ard.io.scene_formats import WRITTEN, SceneFormat, check_options, scene_format, written_bytes
@@ -126,7 +126,7 @@ def convert(
 
     scenes, output = _part_paths(run, scenes, output)
     given = {"spz_version": spz_version, "compress": compress, "layout": layout}
-    options: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
+    options: Named = {name: value for name, value in given.items() if value is not None}
     if layout is not None and sh_degree not in (None, 3):
         raise typer.BadParameter("--layout inria has SH degree 3; leave --sh-degree out")
     matrix = None if transform is None else _read_matrix(transform)
@@ -186,7 +186,7 @@ def _part_paths(run: Run, paths: list[Path], output: Path | None) -> tuple[list[
     return scenes, output
 
 
-def _check_output(run: Run, output: Path, options: dict[str, Any]) -> None:
+def _check_output(run: Run, output: Path, options: Named) -> None:
     """Check the output and the options of its format."""
     if output.suffix.lower() != ".csv":
         check_options(output, options)
@@ -197,9 +197,7 @@ def _check_output(run: Run, output: Path, options: dict[str, Any]) -> None:
     run.claim_file("--output", output)
 
 
-def _add_axes(
-    options: dict[str, Any], output_format: SceneFormat, output: Path, axes: Axes
-) -> dict[str, Any]:
+def _add_axes(options: Named, output_format: SceneFormat, output: Path, axes: Axes) -> Named:
     """Return the writer's options, with other axes than those that its format defines."""
     if axes == output_format.axes:
         return options

@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections import Counter
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from g2ard.cli import options as opt
 from g2ard.cli.command import command
 from g2ard.cli.run import Run
-from g2ard.config.choices import BLACK, LpipsInput
+from g2ard.config.choices import BLACK, LpipsInput, Named
 from g2ard.errors import InputError
 from g2ard.io import Source
 from g2ard.report.labels import name_scenes
@@ -132,7 +132,7 @@ def evaluate(
     unshrunk = teaching.full_size(keep_larger(full, size))
     cameras = targets.cameras
     networks = load_lpips(lpips, scaled=lpips_input == "scaled") if lpips else None
-    rows: list[dict[str, Any]] = []
+    rows: list[Named] = []
     found = []
     judged = []
     loaded: list[Splats] = []
@@ -261,7 +261,7 @@ def _measure_drift(frozen: Splats, splats: Splats, path: Path) -> float:
     return drift95(Anchors.of(frozen.narrowed(splats.offset)), splats.means)
 
 
-def _describe_own_size(names: list[str], rows: list[dict[str, Any]]) -> str:
+def _describe_own_size(names: list[str], rows: list[Named]) -> str:
     """Describe the scores at the views' own size.
 
     >>> score = {"psnr": 25.5, "ssim": 0.8, "scored_in": "7 photos, 960×540 px"}
@@ -279,7 +279,7 @@ def _format_lpips(scores: dict[str, float]) -> str:
     return " ".join(f"{net} {value:.4f}" for net, value in scores.items())
 
 
-def _print_table(run: Run, title: str, rows: list[dict[str, Any]]) -> None:
+def _print_table(run: Run, title: str, rows: list[Named]) -> None:
     from g2ard.rendering.metrics import METRICS
 
     columns = {

@@ -6,13 +6,14 @@ import math
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from g2ard.cli import options as opt
 from g2ard.cli.command import command, describe_error
 from g2ard.cli.run import Run
+from g2ard.config.choices import Named
 from g2ard.errors import InputError
 from g2ard.io.detect import run_scene
 from g2ard.progress import plural
@@ -71,7 +72,7 @@ def info(
         raise typer.Exit(1)
 
 
-def _describe(given: ViewFiles) -> tuple[dict[str, Any], list[list[str]]]:
+def _describe(given: ViewFiles) -> tuple[Named, list[list[str]]]:
     """Return a file's figures, with scores for a run, and the table rows that show them."""
     from g2ard.cli.run_folder import describe_stopped_run
     from g2ard.io.describe import describe
@@ -107,18 +108,18 @@ def _describe(given: ViewFiles) -> tuple[dict[str, Any], list[list[str]]]:
     return figures, [*_list_figures(figures), *rows]
 
 
-def _add_note(figures: dict[str, Any], text: str) -> None:
+def _add_note(figures: Named, text: str) -> None:
     figures["notes"].append({"code": "no_points", "count": 1, "text": text.removeprefix("warning: ")})
 
 
-def _measure_overdraw(splats: Splats) -> dict[str, Any]:
+def _measure_overdraw(splats: Splats) -> Named:
     from g2ard.jobs.close_up import close_up
 
     found = close_up(splats)
     return {} if found is None else {"close_overdraw": found}
 
 
-def _read_scores(report: dict[str, Any]) -> tuple[str, dict[str, dict[str, float]]]:
+def _read_scores(report: Named) -> tuple[str, dict[str, dict[str, float]]]:
     """Return the name of a run's targets and its scores."""
     scores = {}
     for name, found in report["scores"].items():
@@ -126,7 +127,7 @@ def _read_scores(report: dict[str, Any]) -> tuple[str, dict[str, dict[str, float
     return report["against"], scores
 
 
-def _list_stopped(path: Path, stopped: dict[str, Any]) -> list[list[str]]:
+def _list_stopped(path: Path, stopped: Named) -> list[list[str]]:
     rows = [["stopped run", ", ".join(stopped["kept"]) + " kept"]]
     if "config" in stopped:
         rows.append(["Gaussians", f"{stopped['input_count']:,} → {stopped['output_count']:,}"])
@@ -163,7 +164,7 @@ def _show(run: Run, title: str, rows: list[list[str]]) -> None:
     run.console.table(title, ["", ""], rows, stdout=run.json != "-")
 
 
-def _list_figures(figures: dict[str, Any]) -> list[list[str]]:
+def _list_figures(figures: Named) -> list[list[str]]:
     """Return the (label, text) rows of a table of what `describe` found; keys depend on the kind of file."""
     unit = {"splats": "Gaussians", "points": "points", "views": "views"}[figures["kind"]]
     rows = [

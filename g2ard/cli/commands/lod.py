@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from contextlib import nullcontext
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -16,7 +16,7 @@ from g2ard.cli.command import command
 from g2ard.cli.outputs import refuse_file
 from g2ard.cli.run import Run
 from g2ard.cli.work_folder import read_tiling, work_folder
-from g2ard.config.choices import BLACK, UNITS, LengthUnit
+from g2ard.config.choices import BLACK, UNITS, LengthUnit, Named
 from g2ard.io.atomic import hidden_name
 from g2ard.progress import plural
 
@@ -200,7 +200,7 @@ def lod(
     else:
         held = stoppable(run, stopped, resume, meta)
     noted = record_finish(run, meta) if tiled and not dry_run else nullcontext()
-    options: dict[str, Any] = {"ratios": ratios, "recover": recover, "steps": steps, "background": colour}
+    options: Named = {"ratios": ratios, "recover": recover, "steps": steps, "background": colour}
     options |= {"split_sky": environment, "seed": run.seed, **run.callbacks}
     options |= {"views": views, "size": size, "up": up, "beside": scene, "memory": tiling.memory}
     with held, noted, open_levels(given, how, planned=dry_run, **options) as job:
@@ -216,7 +216,7 @@ def lod(
             begun = tiling.folder / f"written-{key_of(content)}"
             begun.mkdir(exist_ok=True)
         run.begin("write")
-        common: dict[str, Any] = {"cut": rule, "overwrite": run.overwrite, "work": begun, **run.callbacks}
+        common: Named = {"cut": rule, "overwrite": run.overwrite, "work": begun, **run.callbacks}
         axis: Sequence[float] | None = up
         if kind == "sog":
             written = save_levels(output, levels.splats, environment=levels.sky, **common)

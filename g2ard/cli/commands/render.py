@@ -21,9 +21,7 @@ from g2ard.io.paths import output_names
 from g2ard.progress import plural
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
+    from g2ard.arrays import Bytes, Float32
     from g2ard.rendering.renderer import Rendered
 
 _NO_FOLDER = (".jpg", ".jpeg", ".avi", ".mov", ".mkv", ".webm")
@@ -147,13 +145,13 @@ def render(
     if output is not None:
         files = (_name_files(output / place, depth) for place in places)
         run.claim("--output", *chain.from_iterable(files))
-    shown: list[NDArray[np.uint8]] = []
+    shown: list[Bytes] = []
     colour = opt.background_of(run, background, scene) or BLACK
     generated = turn is not None or looks is not None or is_planned(found)
     sky = generated and colour == BLACK and background is None and choose_backdrop(None, [splats]) is None
     renderer = Renderer(splats, background=colour, settings=RasterSettings(convention=convention))
 
-    def draw(folder: Path | None) -> Iterator[NDArray[np.uint8]]:
+    def draw(folder: Path | None) -> Iterator[Bytes]:
         for view in range(len(cameras)):
             camera = cameras[view]
             rendered: Rendered | None = None
@@ -216,7 +214,7 @@ def _name_files(stem: Path, depth: bool) -> list[Path]:
     return [stem.with_name(stem.name + suffix) for suffix in (".png", ".depth.npy")[: 1 + depth]]
 
 
-def _write_view(stem: Path, image: NDArray[np.float32], depth: NDArray[np.float32] | None) -> None:
+def _write_view(stem: Path, image: Float32, depth: Float32 | None) -> None:
     """Write the files of one view."""
     import numpy as np
 
@@ -229,9 +227,7 @@ def _write_view(stem: Path, image: NDArray[np.float32], depth: NDArray[np.float3
         np.save(depths[0], depth)
 
 
-def _write_sheet(
-    path: Path, images: list[NDArray[np.uint8]], names: tuple[str, ...], overwrite: bool
-) -> None:
+def _write_sheet(path: Path, images: list[Bytes], names: tuple[str, ...], overwrite: bool) -> None:
     """Write a roughly square grid of all images, captioned by row."""
     from g2ard.io.images import write_png
     from g2ard.report.sheet import draw_contact_sheet

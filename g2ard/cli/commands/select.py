@@ -16,9 +16,7 @@ from g2ard.pipeline.presets import configure
 from g2ard.progress import plural
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
+    from g2ard.arrays import Float, Int
     from g2ard.config.choices import ViewFormat
     from g2ard.io.types import ViewSet
 
@@ -116,8 +114,8 @@ def _write(
     output: Path,
     format: ViewFormat | None,
     pool: ViewSet,
-    chosen: NDArray[np.int64],
-    weights: NDArray[np.float64],
+    chosen: Int,
+    weights: Float,
 ) -> None:
     """Write the chosen views, best first, then the other views outside the training split."""
     import numpy as np
