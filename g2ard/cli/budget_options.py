@@ -116,9 +116,12 @@ class Ratios(tuple[float, ...]):
 BUDGET_FLAGS = "-n COUNT, -r RATIO, --fit, or --min-psnr and --min-ssim"
 """Options of a budget, for messages."""
 
-BUDGETS: dict[str, tuple[Any, ...]] = {
+Options = dict[str, tuple[Any, ...]]
+"""Name → type and option, then a default unless it is None."""
+
+BUDGETS: Options = {
     "count": (
-        list[Counts] | None,
+        list[Counts],
         typer.Option(
             "-n",
             "--count",
@@ -128,7 +131,7 @@ BUDGETS: dict[str, tuple[Any, ...]] = {
         ),
     ),
     "ratio": (
-        list[Ratios] | None,
+        list[Ratios],
         typer.Option(
             "-r",
             "--ratio",
@@ -138,7 +141,7 @@ BUDGETS: dict[str, tuple[Any, ...]] = {
         ),
     ),
     "fit": (
-        str | None,
+        str,
         typer.Option(
             metavar="5MB|page:10MB|DEVICE",
             help="Largest scene that fits the size of a file or of a page with it, or a device: "
@@ -146,15 +149,15 @@ BUDGETS: dict[str, tuple[Any, ...]] = {
         ),
     ),
     "min_psnr": (
-        float | None,
+        float,
         typer.Option(min=1, help="Smallest scene with at least this PSNR against the original, dB."),
     ),
     "min_ssim": (
-        float | None,
+        float,
         typer.Option(min=0.01, max=0.9999, help="Smallest scene with at least this SSIM."),
     ),
 }
-"""Options of commands with budgets, see `g2ard.cli.command.command`: name → type and option."""
+"""Options of commands with budgets, see `g2ard.cli.command.command`."""
 
 SEVERAL = {
     "count": " Several (10k,20k) need {count} in --output.",
@@ -162,9 +165,9 @@ SEVERAL = {
 }
 """Ends of the help texts of commands that take several budgets."""
 
-TILES: dict[str, tuple[Any, ...]] = {
+TILES: Options = {
     "tile_rows": (
-        Count | None,
+        Count,
         typer.Option(
             parser=Count.parse_absolute,
             metavar="COUNT",
@@ -172,22 +175,22 @@ TILES: dict[str, tuple[Any, ...]] = {
         ),
     ),
     "memory": (
-        str | None,
+        str,
         typer.Option(metavar="SIZE", help="Memory limit for all workers together, such as 4GB."),
     ),
     "workers": (
-        int | None,
+        int,
         typer.Option(min=1, help="Processes for tiles; by default as many as cores and memory allow."),
     ),
     "scheduler": (
-        str | None,
+        str,
         typer.Option(
             metavar="ADDRESS",
             help="Dask scheduler for tiles: tcp://HOST:PORT or local (needs the extra `distributed`).",
         ),
     ),
     "work": (
-        Path | None,
+        Path,
         typer.Option(
             metavar="DIR",
             help="Keep tiles and finished steps here, for other budgets; by default in .NAME.tiles beside "
@@ -195,4 +198,4 @@ TILES: dict[str, tuple[Any, ...]] = {
         ),
     ),
 }
-"""Options of commands that work in tiles, see `g2ard.cli.command.command`: name → type and option."""
+"""Options of commands that work in tiles, see `g2ard.cli.command.command`."""

@@ -64,8 +64,10 @@ class Claims:
         self.claim(flag, *files_of(path))
         check_scene_output(path, self.overwrite)
 
-    def claim_file(self, flag: str, path: Path, *, page: bool = False) -> None:
-        """Record a file or a page that an option writes, and check that it can be written."""
+    def claim_file(self, flag: str, path: Path | None, *, page: bool = False) -> None:
+        """Record a file or a page that an option writes, if it is given, and check that it can be written."""
+        if path is None:
+            return
         self.claim(flag, path)
         if page:
             from g2ard.viewer.page import check_page_output

@@ -20,7 +20,7 @@ from typing import Annotated, Any, NoReturn
 import typer
 
 from g2ard.cli.app import app
-from g2ard.cli.budget_options import BUDGETS, SEVERAL, TILES
+from g2ard.cli.budget_options import BUDGETS, SEVERAL, TILES, Options
 from g2ard.cli.config_file import load_config, write_config
 from g2ard.cli.fields import FIELDS
 from g2ard.cli.panels import Command, in_panel, ordered
@@ -51,11 +51,11 @@ def _prefer_flags(ctx: typer.Context, values: Named, defaults: Named) -> None:
                 values[other] = defaults[other]
 
 
-_COMMON_OPTIONS: dict[str, tuple[Any, ...]] = {
+_COMMON_OPTIONS: Options = {
     "quiet": (bool, typer.Option("-q", "--quiet", help="Print errors only."), False),
     "verbose": (bool, typer.Option("-v", "--verbose", help="Print more details."), False),
     "overwrite": (bool, typer.Option("-w", "--overwrite", help="Replace existing outputs."), False),
-    "json": (str | None, typer.Option(metavar="FILE|-", help="Write the result as JSON; - is stdout.")),
+    "json": (str, typer.Option(metavar="FILE|-", help="Write the result as JSON; - is stdout.")),
     "seed": (int, typer.Option(min=0, help="Random seed."), 0),
     "threads": (int, typer.Option(min=0, max=256, help="CPU threads; 0 uses all cores."), 0),
     "device": (str, typer.Option(metavar="auto|cpu|gpu", help="Where to compute."), "auto"),
@@ -65,38 +65,38 @@ _COMMON_OPTIONS: dict[str, tuple[Any, ...]] = {
         False,
     ),
     "config": (
-        Path | None,
+        Path,
         typer.Option(metavar="FILE.toml", callback=load_config, is_eager=True, help="Read default options."),
     ),
 }
-"""Name → type, option and default, None if left out."""
+"""Options of all commands."""
 
-_SETTINGS: dict[str, tuple[Any, ...]] = {
+_SETTINGS: Options = {
     "set": (
-        list[str] | None,
+        list[str],
         typer.Option(
             metavar="PATH=VALUE",
             help="Change any setting by its path; repeatable. See docs/options.md.",
         ),
     )
 }
-_SCENE_OPTIONS: dict[str, tuple[Any, ...]] = {
+_SCENE_OPTIONS: Options = {
     "render_model": (
-        RenderModel | None,
+        RenderModel,
         typer.Option(help="How the scenes are drawn, if their files do not say it or say it wrongly."),
     )
 }
 
 
-_POINT_OPTIONS: dict[str, tuple[Any, ...]] = {
+_POINT_OPTIONS: Options = {
     "box": (
-        str | None,
+        str,
         typer.Option(
             metavar="X,Y,Z,X,Y,Z", help="Of a point cloud, keep points between two corners, in its units."
         ),
     ),
     "where": (
-        str | None,
+        str,
         typer.Option(
             metavar="CONDITION",
             help="Of a point cloud, keep points for which this holds, such as 'classification == 2'. Names "
@@ -104,7 +104,7 @@ _POINT_OPTIONS: dict[str, tuple[Any, ...]] = {
         ),
     ),
     "color": (
-        PointColor | None,
+        PointColor,
         typer.Option(help="Colour points by their intensity, or by their class."),
     ),
 }
@@ -150,9 +150,7 @@ def command(
             option.help += end
             shared_options[key] = (kind, option)
         shared_options |= {
-            path.rpartition(".")[2]: (kind | None, option)
-            for path, (kind, option) in FIELDS.items()
-            if path in fields
+            path.rpartition(".")[2]: option for path, option in FIELDS.items() if path in fields
         }
         shared_options |= _COMMON_OPTIONS
         shared_options |= {} if settings is None else _SETTINGS
@@ -175,7 +173,7 @@ def command(
                 shared_values["set"] = typed_last
             printing = shared_values.pop("print_config")
             run = Run(name, shared_values, dict(values), map_flags(ctx.command), outputs, fields)
-            run.typed = frozenset(name for name in values if is_typed(ctx, name))
+            run.typed = frozenset(name for name in run.config if is_typed(ctx, name))
             if printing:
                 if settings and run.config["set"]:
                     run.settle(resolve_name(settings)(), run.config.get("preset"))
@@ -197,6 +195,9 @@ def command(
 
 
 def _create_parameter(name: str, kind: Any, option: Any, default: Any = None) -> inspect.Parameter:
+    """Return the parameter of an option, which is None without a default."""
+    if default is None:
+        kind = kind | None
     annotation = Annotated[kind, option]
     return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
 

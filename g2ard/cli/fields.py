@@ -1,11 +1,12 @@
 """Flags of settings, by the paths of the settings; `g2ard.cli.command.command` adds them to commands."""
 
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
+from g2ard.cli.budget_options import Options
 from g2ard.cli.options import duration
-from g2ard.config.choices import AdaptSchedule, Engine, Focus, Method, Policy, ScheduleName
+from g2ard.config.choices import AdaptSchedule, Engine, Focus, Method, Policy, Refinement, ScheduleName
 from g2ard.errors import InputError
 
 
@@ -33,7 +34,7 @@ _ENGINE = typer.Option(
     help="Engine of the steps, with equal results up to rounding: fused (Rust or --device gpu, the "
     "default) or torch (autograd; needs the extra `torch`)."
 )
-FIELDS: dict[str, tuple[Any, Any]] = {
+FIELDS: Options = {
     "simplify.method": (Method, typer.Option(help="Simplification method.")),
     "simplify.keep_region": (
         list[Spot],
@@ -82,6 +83,30 @@ FIELDS: dict[str, tuple[Any, Any]] = {
         typer.Option(
             min=0, help="Weight of the old appearance, as a number of views; 1 by default, 0 in the paper."
         ),
+    ),
+    "register.size": (
+        int,
+        typer.Option(min=32, metavar="PIXELS", help="Shrink photos to this longer side; 1000 by default."),
+    ),
+    "register.matcher": (
+        str,
+        typer.Option(
+            metavar="auto|sift|direct|MODULE:FUNCTION",
+            help="Feature matcher: SIFT, none (direct alignment only), or your own function. "
+            "All but direct need the extra `register`; auto, the default, uses SIFT if it is installed.",
+        ),
+    ),
+    "register.refine": (
+        Refinement,
+        typer.Option(help="How to refine poses from feature matching; auto by default."),
+    ),
+    "register.passes": (
+        int,
+        typer.Option(min=1, help="Maximum renders to match per photo; 3 by default."),
+    ),
+    "register.accept": (
+        float,
+        typer.Option(min=0.01, max=1, help="Lowest ZNCC of a registered photo; 0.6 by default."),
     ),
 }
 """Path of a setting → type and option of its flag."""

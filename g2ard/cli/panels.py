@@ -81,7 +81,8 @@ for _topic, _names in _PANELS.items():
 
 def ordered(command: str, parameters: list[Parameter]) -> list[Parameter]:
     """Return a command's parameters with used options first, the others by topic."""
-    used, topics = USED[command], list(_PANELS)
+    used = USED[command]
+    topics = list(_PANELS)
 
     def place(parameter: Parameter) -> tuple[int, int, int]:
         if parameter.name in used:

@@ -150,6 +150,10 @@ class Run(Claims):
         failed = "" if self._failed is None else f"{self._failed} failed: "
         return "; ".join([failed + reason, *self.kept])
 
+    def note_written(self, path: Path) -> None:
+        """Remember an output that is complete, for messages of later errors."""
+        self.kept.append(f"{path} is written")
+
     def progress(self, stage: str, done: int, total: int, info: Mapping[str, Any] | None = None) -> None:
         """Report progress, after GPU messages since the last call."""
         self.tell_notes()
@@ -236,11 +240,11 @@ class Run(Claims):
         if not isinstance(splats, Splats):
             if scene_format(path).suffix == ".ply":
                 write_ply(path, splats, overwrite=replaced)
-                self.kept.append(f"{path} is written")
+                self.note_written(path)
                 return
             splats = splats.whole()
         notes = write_scene(path, splats, overwrite=replaced, progress=self.progress, **options)
-        self.kept.append(f"{path} is written")
+        self.note_written(path)
         tell(path, notes, self.say)
         if about_axes := axes_note(path, options):
             self.say(f"note: {path}: {about_axes}")
@@ -267,7 +271,7 @@ class Run(Claims):
 
         overwrite = self.overwrite or overwrite
         write_views(path, cameras, splits=splits, weights=weights, format=format, overwrite=overwrite)
-        self.kept.append(f"{path} is written")
+        self.note_written(path)
         if lost := lost_views(cameras, view_format(path, format), splits, weights is not None):
             self.say(
                 f"note: {path} leaves out {' and '.join([', '.join(lost[:-1]), lost[-1]][len(lost) == 1 :])}"

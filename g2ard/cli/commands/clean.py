@@ -99,8 +99,7 @@ def clean(
     if dry_run:
         _tell_plan(run, source.scene.count, cost_of_cleaning(source.scene, wanted))
         return
-    if preview is not None:
-        run.claim_file("--preview", preview)
+    run.claim_file("--preview", preview)
     for flag, path in (("--output", output), ("--split-sky", split_sky)):
         if path is not None:
             run.claim_scene(flag, path)

@@ -96,10 +96,9 @@ def evaluate(
 
     if lpips_input != "scaled" and lpips is None:
         raise typer.BadParameter("--lpips-input goes with --lpips; give --lpips DIR")
-    if output is not None:
-        if len(scenes) < 2:
-            raise typer.BadParameter("--output compares sizes; give several scenes")
-        run.claim_file("--output", output, page=True)
+    if output is not None and len(scenes) < 2:
+        raise typer.BadParameter("--output compares sizes; give several scenes")
+    run.claim_file("--output", output, page=True)
     own = None
     if views is None and teacher is None:
         own = find_common(scenes, background=background is not None)
@@ -243,7 +242,7 @@ def _write_ladder(
         settings=settings,
         overwrite=run.overwrite,
     )
-    run.kept.append(f"{output} is written")
+    run.note_written(output)
     advice = recommend_size(rungs)
     run.say(f"{output}: {advice}")
     return advice

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -88,28 +89,30 @@ def _describe(given: ViewFiles) -> tuple[Named, list[list[str]]]:
         if figures["kind"] == "views":
             from g2ard.jobs.start_points import find_sparse_file, read_sparse_points
 
-            points = read_sparse_points(find_sparse_file(path), partial(_add_note, figures))
+            said: list[str] = []
+            points = read_sparse_points(find_sparse_file(path), said.append)
             figures["sparse_points"] = 0 if points is None else len(points)
+            for text in said:
+                note = {"code": "no_points", "count": 1, "text": text.removeprefix("warning: ")}
+                figures["notes"].append(note)
         return figures, _list_figures(figures)
     figures = describe(scene, _measure_overdraw)
     report = read_json(path / "report.json")
-    against, scores = _read_scores(report)
-    figures["run"] = {"input_count": report["input_count"], "against": against, "scores": scores}
+    against = report["against"]
     photos = report.get("photos")
     one = "point" if report.get("lifted") else "Gaussian"
     rows = [["made from", plural(photos, "photo") if photos else plural(report["input_count"], one)]]
-    figures["run"]["overdraw"] = report["overdraw"]
     rows.append(["Gaussians per pixel, held-out", f"{report['overdraw']:.1f}"])
     words = {"simplified": "start" if photos else "simplified", "recovered": RESULT}
-    for name, found in scores.items():
-        ssim = f", SSIM {found['ssim']:.4f}" if "ssim" in found else ""
-        size = f", {report['size']}" if "size" in report else ""
-        rows.append([words[name], f"{found['psnr']:.2f} dB{ssim} against {against}{size}"])
+    size = f", {report['size']}" if "size" in report else ""
+    scores = {}
+    for name, found in report["scores"].items():
+        scores[name] = {"psnr": found["psnr"], "ssim": found["ssim"]}
+        score = f"{found['psnr']:.2f} dB, SSIM {found['ssim']:.4f}"
+        rows.append([words[name], f"{score} against {against}{size}"])
+    made_from = {"input_count": report["input_count"], "against": against}
+    figures["run"] = {**made_from, "scores": scores, "overdraw": report["overdraw"]}
     return figures, [*_list_figures(figures), *rows]
-
-
-def _add_note(figures: Named, text: str) -> None:
-    figures["notes"].append({"code": "no_points", "count": 1, "text": text.removeprefix("warning: ")})
 
 
 def _measure_overdraw(splats: Splats) -> Named:
@@ -117,14 +120,6 @@ def _measure_overdraw(splats: Splats) -> Named:
 
     found = close_up(splats)
     return {} if found is None else {"close_overdraw": found}
-
-
-def _read_scores(report: Named) -> tuple[str, dict[str, dict[str, float]]]:
-    """Return the name of a run's targets and its scores."""
-    scores = {}
-    for name, found in report["scores"].items():
-        scores[name] = {"psnr": found["psnr"], "ssim": found["ssim"]}
-    return report["against"], scores
 
 
 def _list_stopped(path: Path, stopped: Named) -> list[list[str]]:
@@ -178,10 +173,7 @@ def _list_figures(figures: Named) -> list[list[str]]:
         rows.append(["render model", figures["render_model"]])
     if any(figures.get("offset", ())):
         rows.append(["offset", _format_vector(figures["offset"], 3)])
-    if "map_system" in figures:
-        rows.append(["map system", figures["map_system"]])
-    if "metres_per_unit" in figures:
-        rows.append(["unit", _name_unit(figures["metres_per_unit"])])
+    rows += _list_known(figures, {"map_system": ("map system", str), "metres_per_unit": ("unit", _name_unit)})
     extent = figures["extent"]
     longest = max(high - low for low, high in zip(extent["min"], extent["max"], strict=True))
     digits = max(0, 3 - math.floor(math.log10(longest or 1)))
@@ -189,22 +181,28 @@ def _list_figures(figures: Named) -> list[list[str]]:
         _format_vector(extent[name], digits) for name in ("min", "max", "robust_min", "robust_max")
     )
     rows += [["extent", f"{low} to {high}"], ["98 % of it", f"{near} to {far}"]]
-    for key in ("opacity", "largest_scale", "smallest_scale", "elongation"):
-        if key in figures:
-            rows.append([key.replace("_", " "), _describe_spread(figures[key])])
-    if "fov_degrees" in figures:
-        rows.append(["field of view", _describe_spread(figures["fov_degrees"], "°")])
-    if "close_overdraw" in figures:
-        close = figures["close_overdraw"]
-        rows.append(["Gaussians per pixel, near", f"{close['mean']:.0f}, at worst {close['worst']:.0f}"])
-    if "color" in figures:
-        rows.append(["mean colour", _format_vector(figures["color"]["mean"], 2)])
-    rows += [[key, f"{figures[key]:,}"] for key in ("photos", "distorted") if key in figures]
-    if "sparse_points" in figures:
-        rows.append(["sparse points", f"{figures['sparse_points']:,}"])
+    spreads = ("opacity", "largest_scale", "smallest_scale", "elongation")
+    counts = ("photos", "distorted", "sparse_points")
+    formats: _Formats = {
+        **{key: (key.replace("_", " "), _describe_spread) for key in spreads},
+        "fov_degrees": ("field of view", partial(_describe_spread, unit="°")),
+        "close_overdraw": ("Gaussians per pixel, near", "{0[mean]:.0f}, at worst {0[worst]:.0f}".format),
+        "color": ("mean colour", lambda color: _format_vector(color["mean"], 2)),
+        **{key: (key.replace("_", " "), "{:,}".format) for key in counts},
+    }
+    rows += _list_known(figures, formats)
     for key in ("sizes", "splits", "odd"):
         rows += [[name.replace("_", " "), f"{count:,}"] for name, count in figures.get(key, {}).items()]
     return rows + [["note", note["text"]] for note in figures["notes"]]
+
+
+_Formats = dict[str, tuple[str, Callable[[Any], str]]]
+"""Figure → its label, and what formats it."""
+
+
+def _list_known(figures: Named, formats: _Formats) -> list[list[str]]:
+    """Return the rows of the figures that are known, in the order of `formats`."""
+    return [[label, write(figures[key])] for key, (label, write) in formats.items() if key in figures]
 
 
 def _describe_spread(quantiles: dict[str, float], unit: str = "") -> str:

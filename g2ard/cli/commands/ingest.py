@@ -77,7 +77,7 @@ def ingest(
             **run.callbacks,
         )
     seconds = time.perf_counter() - began
-    run.kept.append(f"{output} is written")
+    run.note_written(output)
     for note in store.notes:
         run.say(f"{scenes[0]}: {note}")
     halo = sum(tile.halo for tile in store.tiles)

@@ -12,7 +12,7 @@ import typer
 from g2ard.cli import options as opt
 from g2ard.cli.command import command
 from g2ard.cli.run import Run
-from g2ard.config.choices import Keep, Refinement
+from g2ard.config.choices import Keep
 from g2ard.config.schema import listed
 from g2ard.errors import InputError
 from g2ard.progress import plural
@@ -64,27 +64,6 @@ def register(
             metavar="PX", min=1, help="Focal length for a folder of photos, pixels; by default their EXIF's."
         ),
     ] = None,
-    size: Annotated[
-        int | None,
-        typer.Option(min=32, metavar="PIXELS", help="Shrink photos to this longer side; 1000 by default."),
-    ] = None,
-    matcher: Annotated[
-        str | None,
-        typer.Option(
-            metavar="auto|sift|direct|MODULE:FUNCTION",
-            help="Feature matcher: SIFT, none (direct alignment only), or your own function. "
-            "All but direct need the extra `register`; auto, the default, uses SIFT if it is installed.",
-        ),
-    ] = None,
-    refine: Annotated[
-        Refinement | None, typer.Option(help="How to refine poses from feature matching; auto by default.")
-    ] = None,
-    passes: Annotated[
-        int | None, typer.Option(min=1, help="Maximum renders to match per photo; 3 by default.")
-    ] = None,
-    accept: Annotated[
-        float | None, typer.Option(min=0.01, max=1, help="Lowest ZNCC of a registered photo; 0.6 by default.")
-    ] = None,
     keep: Annotated[
         Keep, typer.Option(help="Photos to write; with all, photos without a pose keep their initial one.")
     ] = "registered",
@@ -114,8 +93,7 @@ def register(
     if intrinsics is not None and focal is not None:
         raise typer.BadParameter("--intrinsics and --focal exclude each other; give one")
     run.claim_views(output, format)
-    if report is not None:
-        run.claim_file("--report", report, page=True)
+    run.claim_file("--report", report, page=True)
     job = prepare(
         scene,
         photos,

@@ -124,8 +124,7 @@ def render(
         what = "panoramas are twice as wide as high" if around else "given views keep their shape"
         raise typer.BadParameter(f"--size: {what}; give one number, not {size}")
     views = opt.with_images(views, images)
-    if sheet is not None:
-        run.claim_file("--sheet", sheet)
+    run.claim_file("--sheet", sheet)
     splats = run.load(scene)
     found: Any
     if turn is not None:
@@ -175,11 +174,12 @@ def render(
             write_png(file, next(draw(None)), overwrite=run.overwrite)
         else:
             write_animation(file, draw(None), fps=fps, overwrite=run.overwrite)
-        run.kept.append(f"{file} is written")
+        run.note_written(file)
     else:
         with nullcontext() if output is None else atomic_folder(output, run.overwrite) as folder:
             deque(draw(folder), maxlen=0)
-    run.kept += [f"{output} is written"] if output is not None else []
+    if output is not None:
+        run.note_written(output)
     written = [str(path) for path in (output, file) if path]
     if sheet is not None:
         with run.showing("--sheet") if written else run.finishing("--sheet"):
