@@ -39,7 +39,6 @@ from g2ard.rendering.targets import fill
 from g2ard.report.labels import DENSE, RESULT, label_scenes, name_scenes
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats
-from g2ard.viewer.page import write_page
 
 if TYPE_CHECKING:
     from g2ard.jobs.distill_job import DistillJob
@@ -286,8 +285,7 @@ class RunFolder:
             scenes = [dense[1], splats]
             roles = [DENSE, RESULT]
         labels = label_scenes(shown, [len(scene) for scene in scenes], roles)
-        turned = [(label, stand.of(scene)) for label, scene in zip(labels, scenes, strict=True)]
-        written, _ = write_page(self._view, turned, start=stand.start, background=behind, overwrite=True)
+        written, _ = stand.write_page(self._view, labels, scenes, background=behind, overwrite=True)
         return written, f"view: {self._view} ({written / 1e6:.2f} MB)"
 
     @staticmethod

@@ -124,35 +124,45 @@ def find_count_for_bytes(
     count = int(len(sample) * wanted / measure_file(sample, name))
     if reduce is None:
         return min(max(count, fewest), most)
-    fits = (0, 0)
-    over = (most + 1, 0)  # (count, bytes); 0 bytes means no such file yet
-    files: list[tuple[int, int]] = []
-    while len(files) < _BYTES_PROBES or not fits[0]:
-        count = min(max(count, fits[0] + 1, fewest), over[0] - 1, most)
+    goal = _BYTES_GOAL * wanted
+    fits = small = 0  # largest count that fits, and its bytes
+    over = most + 1  # smallest count that does not
+    large = 0  # its bytes; 0 means no such file yet
+    before: tuple[int, int] | None = None  # count and bytes of the file before
+    files = 0
+    while files < _BYTES_PROBES or not fits:
+        files += 1
+        count = min(max(count, fits + 1, fewest), over - 1, most)
         size = measure_file(reduce(count) if count < most else splats, name)
-        size = size * most // len(splats) if count == most else size  # of a sample
-        files.append((count, size))
+        if count == most:
+            size = size * most // len(splats)  # of a sample
         if size <= wanted:
-            fits = (count, size)
+            fits = count
+            small = size
             if size >= _BYTES_ACCEPTED * wanted or count == most:
                 break
         else:
-            over = (count, size)
+            over = count
+            large = size
             if count == fewest:
                 raise InputError(
                     f"{wanted:,} bytes are too few; {count:,} Gaussians take {size:,}", path=name
                 )
-        if over[0] - fits[0] <= 1:
+        gap = over - fits
+        if gap <= 1:
             break
-        if fits[0] and over[1]:  # file sizes grow in steps, so interpolate with limits
-            share = (_BYTES_GOAL * wanted - fits[1]) / (over[1] - fits[1])
-            count = round(fits[0] + min(max(share, 0.1), 0.9) * (over[0] - fits[0]))
+        tried = count, size
+        if fits and large:  # file sizes grow in steps, so interpolate with limits
+            share = (goal - small) / (large - small)
+            count = round(fits + min(max(share, 0.1), 0.9) * gap)
         else:
             near = count * _BYTES_GOAL * wanted / size
-            if len(files) > 1 and (slope := _measure_slope(*files[-2:])) > 0:  # a file has a head too
-                near = count + (_BYTES_GOAL * wanted - size) / slope
+            slope = 0.0 if before is None else (size - before[1]) / (count - before[0])
+            if slope > 0:  # a file has a head too
+                near = count + (goal - size) / slope
             count = int(min(max(near, count / 4), 4 * count))
-    return fits[0]
+        before = tried
+    return fits
 
 
 def _find_count_of_ply(splats: Splats, wanted: int, name: str, most: int) -> int:
@@ -162,10 +172,6 @@ def _find_count_of_ply(splats: Splats, wanted: int, name: str, most: int) -> int
     if count < 1:
         raise InputError(f"{wanted:,} bytes are too few; a Gaussian takes {one:,}", path=name)
     return count
-
-
-def _measure_slope(before: tuple[int, int], after: tuple[int, int]) -> float:
-    return (after[1] - before[1]) / (after[0] - before[0])
 
 
 def find_count_for_layers(count: int, most: float, reduce: Callable[[int], Splats]) -> tuple[int, float]:

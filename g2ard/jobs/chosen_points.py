@@ -158,7 +158,8 @@ class ChosenPoints(PointStream):
             some = good[:: max(1, -(-len(good) * blocks // _SAMPLE))]
             places.append(positions[some])
             shades.append(values[some, :1] if self._shade else np.zeros((0, 1), np.float32))
-        self.count, self.sample = sum(self._counts), np.concatenate(places)
+        self.count = sum(self._counts)
+        self.sample = np.concatenate(places)
         if self._shade:
             found = np.concatenate(shades)
             if len(found) and not np.ptp(found):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -112,7 +111,8 @@ def clean(
     sky = None
     if split_sky:
         far = sky_mask(splats)
-        splats, sky = splats.take(~far), splats.take(far)
+        sky = splats.take(far)
+        splats = splats.take(~far)
         say(
             f"sky: {plural(len(sky), 'Gaussian')}" if len(sky) else "sky: none found, so nothing is split off"
         )
@@ -133,11 +133,19 @@ def clean(
 
 def _plan_views(splats: Splats, seed: int, progress: Progress, represents: float = 1.0) -> Cameras:
     """Return generated views that show clutter; `represents` is that of `plan_pool`."""
-    count = (
-        round(CLUTTER_VIEWS * find_pool_growth(represents * len(splats))) if represents > 1 else CLUTTER_VIEWS
+    count = CLUTTER_VIEWS
+    if represents > 1:
+        count = round(count * find_pool_growth(represents * len(splats)))
+    pool = plan_pool(
+        splats,
+        count,
+        seed=seed,
+        rows=_CLUTTER_ROWS,
+        near=_CLUTTER_NEAR,
+        represents=represents,
+        progress=progress,
     )
-    how: dict[str, Any] = {"rows": _CLUTTER_ROWS, "near": _CLUTTER_NEAR, "represents": represents}
-    return plan_pool(splats, count, seed=seed, progress=progress, **how).cameras.resized(CLUTTER_SIDE)
+    return pool.cameras.resized(CLUTTER_SIDE)
 
 
 def _tell_clutter(clutter: Cleaning, light: float, kinds: Sequence[str], say: Say) -> None:

@@ -194,15 +194,12 @@ def check_job_memory(job: DistillJob, most: int | None, need: int) -> None:
     if most is None or need <= most:
         return
     count = job.total
-    message = (
-        f"--memory: {plural(count, 'Gaussian')} in one piece take about {format_bytes(need, ceil=True)}, "
-    )
+    what = f"{plural(count, 'Gaussian')} in one piece take"
     if job.plan is not None:
         largest = plan_round_counts(job.dense, job.budget.count, job.config)[0]
-        message = f"--memory: recovering {plural(largest, 'Gaussian')} takes about "
-        message += f"{format_bytes(need, ceil=True)}, "
-    message += f"more than {format_bytes(most)}; "
-    message += "fewer Gaussians, a lower --sh-degree and smaller views, --size, take less"
+        what = f"recovering {plural(largest, 'Gaussian')} takes"
+    message = f"--memory: {what} about {format_bytes(need, ceil=True)}, more than {format_bytes(most)}"
+    message += "; fewer Gaussians, a lower --sh-degree and smaller views, --size, take less"
     if job.plan is None and job.renders:  # tiles support this job
         tiles = TileMemory(count, 4 * row_width(job.prior.sh_degree), RECOVERY_TIMES)
         message += f"; in tiles {tiles.advice(most, max(1, count // 2))}"

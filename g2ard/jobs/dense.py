@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -26,7 +26,7 @@ from g2ard.stages.simplify import SimplifyConfig
 from g2ard.tiles.simplify import sample_stride
 
 if TYPE_CHECKING:
-    from g2ard.io.tile_store import TileStore
+    pass
 
 
 @dataclass(eq=False)
@@ -93,19 +93,32 @@ def open_tiles(
     from g2ard.tiles.executor import Executor, Workers, executor
     from g2ard.tiles.ingest import ingest
 
-    store = source.store if source.kind == "splats" else None
-    _check_model(source, store)
-    stream = source.scene if source.kind == "splats" else source.cloud()
+    of_points = source.kind != "splats"
+    store = None if of_points else source.store
+    model = source.render_model
+    if store is not None and model not in (None, store.render_model):
+        raise InputError(
+            f"these tiles are {store.render_model}",
+            path=source.path,
+            hint=f"run `g2ard ingest --render-model {model}` on their scene",
+        )
+    stream = source.cloud() if of_points else source.scene
 
     def running(plan: TilePlan) -> AbstractContextManager[Executor]:
         return executor(plan.workers, max(1, tiling.usable_cores // plan.workers), tiling.scheduler)
 
     if store is None and not planned:
-        how: dict[str, Any] = {"lift": lifting, "overwrite": tiling.overwrite, "say": say}
         with running(plan_tiles(stream, tiling, times)) as runs:
-            folder = tiling.folder / "tiles"
-            rows = tiling.most_rows
-            store = ingest(source, folder, tile_rows=rows, runs=runs, progress=progress, **how)
+            store = ingest(
+                source,
+                tiling.folder / "tiles",
+                tile_rows=tiling.most_rows,
+                lift=lifting,
+                overwrite=tiling.overwrite,
+                runs=runs,
+                progress=progress,
+                say=say,
+            )
     plan = plan_tiles(store or stream, tiling, times)
     say(f"{plan.tiles:,} tiles of {plan.count:,} Gaussians, {plan.workers} at a time")
     if planned or store is None:
@@ -116,16 +129,6 @@ def open_tiles(
     with running(plan) as runs:
         workers = Workers(runs, tiling.folder / "steps", progress)
         yield Opened(InTiles(store, workers, config, tiling.most_rows, tiling.folder), plan, store.notes)
-
-
-def _check_model(source: Source, store: TileStore | None) -> None:
-    model = source.render_model
-    if store is not None and model not in (None, store.render_model):
-        raise InputError(
-            f"these tiles are {store.render_model}",
-            path=source.path,
-            hint=f"run `g2ard ingest --render-model {model}` on their scene",
-        )
 
 
 def _sample_stream(stream: SceneStream | PointStream, lifting: LiftConfig | None) -> Splats:
@@ -140,9 +143,8 @@ def _sample_stream(stream: SceneStream | PointStream, lifting: LiftConfig | None
             scenes.append(block.take(rows))
             read += len(block)
         else:
-            points.append((block[0][rows], block[1][rows]))
+            points.append([array[rows] for array in block])
             read += len(block[0])
     if scenes:
         return join(scenes)
-    positions, colors = (np.concatenate(part) for part in zip(*points, strict=True))
-    return lift(positions, colors, **vars(lifting or LiftConfig()))
+    return lift(*map(np.concatenate, zip(*points, strict=True)), **vars(lifting or LiftConfig()))

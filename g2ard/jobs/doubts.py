@@ -60,7 +60,7 @@ def doubt_views(scene: Splats, cameras: Cameras) -> list[str]:
             f"warning: {coarse:.0%} of the scene is smaller than a pixel in all views; nearer --views, or a "
             "larger --size, would show it"
         )
-    votes = Votes.of(points, sizes, some.opacities.astype(np.float64), len(scene) / len(some))
+    votes = _cast_votes(scene, some)
     outside = norms(cameras.positions - votes.centre) > votes.horizon
     if outside.mean() > 0.5:
         told.append(
@@ -74,7 +74,7 @@ def doubt_merging(scene: Splats, small: Splats, *, blind: bool) -> list[str]:
     """Return warnings about the result of a reduction, `blind` if it had no views."""
     if len(scene) < _FEWEST:
         return []
-    votes = _cast_votes(scene)
+    votes = _cast_votes(scene, _sample_visible(scene))
     found = _doubt_regions(scene, small, votes)
     return found + _doubt_distances(votes) if blind else found
 
@@ -132,8 +132,8 @@ def _measure_sizes(scene: Splats) -> Float:
     return np.sqrt(scales[:, 1] * scales[:, 2])
 
 
-def _cast_votes(scene: Splats) -> Votes:
-    some = _sample_visible(scene)
+def _cast_votes(scene: Splats, some: Splats) -> Votes:
+    """Return the votes of a sample of a scene."""
     represents = len(scene) / max(1, len(some))
     return Votes.of(_find_points(some), _measure_sizes(some), some.opacities.astype(np.float64), represents)
 

@@ -114,27 +114,16 @@ class LevelsJob:
     ratios: Numbers
     sky: Splats | None = None
 
-    @property
-    def counts(self) -> list[int]:
-        """Gaussians of each level."""
-        return [Budget(ratio=ratio).of(self.job.total) for ratio in self.ratios]
+    def plan(self) -> Iterator[tuple[float, int, int]]:
+        """Yield the ratio of each level, its Gaussians, and the longer side in pixels of its views."""
+        longest = int(self.job.views.train.cameras.sides.max())
+        for ratio in self.ratios:
+            shrunk = max(_SMALLEST_VIEW_SIDE, round(longest / ratio**0.25))
+            yield ratio, Budget(ratio=ratio).of(self.job.total), longest if ratio == 1 else shrunk
 
-    @property
-    def sizes(self) -> list[int]:
-        """Longer side in pixels of each level's views."""
-        cameras = self.job.views.train.cameras
-        longest = int(cameras.sides.max())
-        shrunk = (max(_SMALLEST_VIEW_SIDE, round(longest / ratio**0.25)) for ratio in self.ratios)
-        return [longest if ratio == 1 else size for ratio, size in zip(self.ratios, shrunk, strict=True)]
-
-    @property
-    def costs(self) -> list[Cost]:
-        """Cost of each level, nothing for the scene itself."""
-        views = self.job.views
-        return [
-            cost_of(replace(self.job, views=views.resized(size)), count, page=False)
-            for count, size in zip(self.counts, self.sizes, strict=True)
-        ]
+    def cost_of(self, count: int, size: int) -> Cost:
+        """Return the cost of a level that is not the scene itself."""
+        return cost_of(replace(self.job, views=self.job.views.resized(size)), count, page=False)
 
     def run(self, work: Path | None = None) -> Levels[Level]:
         """Make the levels; `work` is the folder for resuming.
@@ -142,14 +131,14 @@ class LevelsJob:
         Each is merged from the one before as it was merged. The job returns a level, the same before
         recovery, and the PSNR of both, None without recovery.
         """
-        job = self.job
         from g2ard.tiles.dense import InTiles
 
+        job = self.job
         levels: list[Level] = []
         reports: list[LevelReport] = []
         finer: Dense = job.dense
         scene = finer
-        for ratio, count, size in zip(self.ratios, self.counts, self.sizes, strict=True):
+        for ratio, count, size in self.plan():
             began = time.perf_counter()
             level = scene
             scores: list[float | None] = []
@@ -193,8 +182,7 @@ def _measure_psnr(job: DistillJob, scene: Dense, on: Targets) -> float:
     """Return the mean PSNR of a level in some views."""
     background = job.config.recover.background
     if isinstance(scene, InMemory):
-        progress = job.progress
-        return evaluate(scene.splats, on, stage="scoring", background=background, progress=progress).psnr
+        return evaluate(scene.splats, on, stage="scoring", background=background, progress=job.progress).psnr
     drawn = scene.images(on.cameras, background)
     return float(np.mean([psnr(drawn[view], on[view]) for view in range(len(on.cameras))]))
 
@@ -229,7 +217,8 @@ def open_levels(
         scene = load_scene(scene, say)
         if (far := sky_mask(scene)).any():
             say(f"sky: {plural(int(far.sum()), 'Gaussian')}, kept whole")
-            scene, sky = scene.take(~far), scene.take(far)
+            sky = scene.take(far)
+            scene = scene.take(~far)
         else:
             say("sky: none found, so nothing is kept apart")
     settings = {"recover.background": background, "recover.seed": seed}
@@ -454,8 +443,7 @@ def write_level_page(
         background: see `g2ard.jobs.viewer_frame.choose_backdrop`.
         source: the source of the scene beside `given`, if it is open.
     """
-    coarse = levels[-1]
-    few = take_evenly(coarse, _ROWS, floor=True)
+    few = take_evenly(levels[-1], _ROWS, floor=True)
     frame = choose_frame(few, given)
     finest = take_evenly(levels[0], _ROWS, floor=True)
     of_points = given.beside is not None and is_made_of_points(Path(given.beside), source)
@@ -465,10 +453,14 @@ def write_level_page(
     title = name_scenes([Path(given.beside or folder)])[0]
     if kind == "sog":
         rotation, position = frame.place(offset, few.axes)
-        placed: dict[str, Any] = {"rotation": rotation, "position": position}
-        antialiased = few.antialiased
         return write_stream_page(
-            page, title, start=frame.start, antialiased=antialiased, background=behind, **placed
+            page,
+            title,
+            start=frame.start,
+            antialiased=few.antialiased,
+            background=behind,
+            rotation=rotation,
+            position=position,
         )
     reach = float(np.linalg.norm(np.ptp(few.means, axis=0)))
     start = frame.start or Start((0.0, reach / 4, -reach), (0.0, 0.0, 0.0), ((1.0, 60.0),))

@@ -32,7 +32,6 @@ from g2ard.report.sheet import draw_contact_sheet
 from g2ard.scene.cameras import Camera, Cameras
 from g2ard.scene.samples import evenly_spaced
 from g2ard.scene.splats import HasSplats, Splats, scene_of
-from g2ard.viewer.page import write_page
 
 _SIZE = (480, 360)
 """Width and height in pixels of a scene's picture."""
@@ -100,10 +99,10 @@ def view(
     labels = label_scenes(named, [len(splats) for splats in loaded])
     stand = choose_frame(loaded[0], GivenViews(views, beside, up, say=say), start)
     page = Path(mkdtemp(prefix="g2ard-")) / "view.html" if output is None else Path(output)
-    write_page(
+    stand.write_page(
         page,
-        [(label, stand.of(splats)) for label, splats in zip(labels, loaded, strict=True)],
-        start=stand.start,
+        labels,
+        loaded,
         background=choose_backdrop(
             background, loaded, of_points=beside is not None and is_made_of_points(beside)
         ),

@@ -123,9 +123,11 @@ def prepare(
     starts = _named(poses, taken.names)
     true = _named(truth or {}, taken.names)
     splats = load_scene(scene, say, render_model)
-    propose_background(taken, background or BLACK, background is not None, say)
-    places = pool if pool is None or isinstance(pool, Cameras) else pool_of(splats, pool, seed, progress, say)
-    return RegisterJob(splats, taken, starts, places, config, keep, background or BLACK, progress, true)
+    behind = background or BLACK
+    propose_background(taken, behind, background is not None, say)
+    if not isinstance(pool, Cameras | None):
+        pool = pool_of(splats, pool, seed, progress, say)
+    return RegisterJob(splats, taken, starts, pool, config, keep, behind, progress, true)
 
 
 @signature_of(prepare)
@@ -271,14 +273,12 @@ def _sizes(files: list[Path]) -> list[tuple[int, int]]:
 
     A broken photo, which registration rejects later, gets the size of another, or (0, 0) if all are broken.
     """
-    found: list[tuple[int, int] | None] = []
+    found: dict[Path, tuple[int, int]] = {}
     for file in files:
-        try:
-            found.append(read_size(file))
-        except InputError:
-            found.append(None)
-    usual = next((size for size in found if size), (0, 0))
-    return [size or usual for size in found]
+        with suppress(InputError):
+            found[file] = read_size(file)
+    usual = next(iter(found.values()), (0, 0))
+    return [found.get(file, usual) for file in files]
 
 
 def _centred(focal: float, size: tuple[int, int]) -> Camera:
@@ -291,38 +291,32 @@ def _lenses(path: Path, names: list[str]) -> list[Camera]:
     """Return the view of each name, or the intrinsics that all views share."""
     views = read_view_set(path, unpictured=True).cameras
     by_name = matched({view.name: view for view in views}, names)
-    one = views[0]
-    shared = all(_same_lens(view, one) for view in views)
+    lenses = {(*view.K.ravel(), *view.distortion, view.width, view.height) for view in views}
     missing = next((name for name in names if name not in by_name), None)
-    if missing is not None and not shared:
+    if missing is not None and len(lenses) > 1:
         raise InputError(
             f"no intrinsics for {missing}, and its views have different ones; add that name, or "
             "use the same intrinsics for all",
             path=path,
         )
-    return [by_name.get(name, one) for name in names]
-
-
-def _same_lens(a: Camera, b: Camera) -> bool:
-    same = np.array_equal(a.K, b.K) and np.array_equal(a.distortion, b.distortion)
-    return same and (a.width, a.height) == (b.width, b.height)
+    return [by_name.get(name, views[0]) for name in names]
 
 
 def _check_aspects(files: list[Path], sizes: list[tuple[int, int]], views: list[Camera]) -> None:
     """Reject intrinsics that fit none of the photos; single misfits are rejected later."""
-    wanted = [(view.width, view.height) for view in views]
-    if any(sizes[0]) and not any(map(_suits, files, sizes, wanted)):
-        (w, h) = sizes[0]
+    if any(sizes[0]) and not any(map(_suits, files, sizes, views)):
+        width, height = sizes[0]
         view = views[0]
         raise InputError(
-            f"the photo is {w}×{h}, but its intrinsics are for {view.width}×{view.height}; "
+            f"the photo is {width}×{height}, but its intrinsics are for {view.width}×{view.height}; "
             "pass intrinsics with the aspect ratio of these photos",
             path=files[0],
         )
 
 
-def _suits(file: Path, size: tuple[int, int], like: tuple[int, int]) -> bool:
+def _suits(file: Path, size: tuple[int, int], view: Camera) -> bool:
     """Return whether a photo, upright if EXIF says so, has the aspect of its view."""
+    like = view.width, view.height
     with suppress(InputError):
         size = read_size(file, like=like)
     return have_same_aspect(size, like)

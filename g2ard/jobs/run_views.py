@@ -251,9 +251,8 @@ def _split_pool(
     twice = None
     if use == "distil" and held_out is None:
         twice = _double_size(scored, max(2, round(share * _TWICE_VIEWS)))
-    validation, apart = _halve_others(others)
     guess = planned.why.rpartition("; ")[2] if "guess" in planned.why else None
-    return RunViews(train, scored, validation, apart, pool, unseen, full, twice, guess)
+    return RunViews(train, scored, *_halve_others(others), pool, unseen, full, twice, guess)
 
 
 def _halve_others(others: Cameras | None) -> tuple[Cameras | None, Cameras | None]:
@@ -552,16 +551,14 @@ def _place_stand_ins(scene: Splats, count: int, size: tuple[int, int]) -> Pool:
     middle = np.median(points, axis=0)
     away = max(3 * float(np.quantile(np.abs(points - middle), 0.9)), np.finfo(np.float32).tiny)
 
-    def cameras(name: str, count: int) -> list[Camera]:
+    def stand_around(kind: str, count: int) -> list[Camera]:
         turns = np.linspace(0, 2 * np.pi, count, endpoint=False)
         eyes = middle + away * np.stack([np.cos(turns), np.sin(turns), np.zeros(count)], axis=1)
         views = (Camera.facing(eye, middle, width=size[0], height=size[1]) for eye in eyes)
-        return [replace(view, name=f"{name}_{row:04}") for row, view in enumerate(views)]
+        return [replace(view, name=f"{kind}_{row:04}", kind=kind) for row, view in enumerate(views)]
 
-    def more(kind: str, count: int) -> list[Camera]:
-        return [replace(view, kind=kind) for view in cameras(kind, count)]
-
-    return Pool(Cameras.of(cameras("pose", count)), _ROUGH, "", np.array([0.0, 0.0, 1.0]), more=more)
+    usual = Cameras.of(stand_around(USUAL, count))
+    return Pool(usual, _ROUGH, "", np.array([0.0, 0.0, 1.0]), more=stand_around)
 
 
 def find_pool_growth(count: float) -> float:

@@ -79,23 +79,24 @@ class Reduction:
     plan: TilePlan | None = None
 
     def __post_init__(self) -> None:
+        config = self.config
         check_seed("seed", self.given.seed)
-        if self.given.views is not None and self.blind:
-            raise InputError("views and blind exclude each other")
-        if self.given.views is not None and self.config.method == "paper":
-            raise InputError("has no effect on the method paper", parameter="views")
-        if isinstance(self.config, Pairs):
-            if self.config.pixel_scale != Pairs.pixel_scale and self._is_weighed:
-                raise InputError("has no effect with views", parameter="simplify.pixel_scale")
-            if self.config.edge_weight != Pairs.edge_weight and not self._is_weighed:
-                raise InputError("has no effect without views", parameter="simplify.edge_weight")
+        if self.given.views is not None:
+            if self.blind:
+                raise InputError("views and blind exclude each other")
+            if config.method == "paper":
+                raise InputError("has no effect on the method paper", parameter="views")
+        if isinstance(config, Pairs):
+            useless = {"pixel_scale": "with views"} if self._is_weighed else {"edge_weight": "without views"}
             for name in ("edge_weight", "dilation") if self.splats.antialiased else ():
-                if getattr(self.config, name) != getattr(Pairs, name):
-                    raise InputError("has no effect on antialiased scenes", parameter=f"simplify.{name}")
+                useless.setdefault(name, "on antialiased scenes")
+            for name, where in useless.items():
+                if getattr(config, name) != getattr(Pairs, name):
+                    raise InputError(f"has no effect {where}", parameter=f"simplify.{name}")
         if self.plan is None:
-            say_regions(self.splats, self.config, "the scene", self.given.say)
+            say_regions(self.splats, config, "the scene", self.given.say)
         else:
-            say_regions(self.splats, self.config, "a sample of the scene", unsaid)
+            say_regions(self.splats, config, "a sample of the scene", unsaid)
 
     @property
     def splats(self) -> Splats:
@@ -162,10 +163,11 @@ class Reduction:
         splats = self.splats
         say = self.given.say
         total = self.total
-        if self.given.rough and (budget.min_psnr is not None or budget.min_ssim is not None):
-            say("the run measures how many Gaussians keep the quality; here, a tenth")
-            return ResolvedBudget(max(1, total // 10))
+        rough = self.given.rough
         if budget.min_psnr is not None or budget.min_ssim is not None:
+            if rough:
+                say("the run measures how many Gaussians keep the quality; here, a tenth")
+                return ResolvedBudget(max(1, total // 10))
             return self._resolve_for_quality(Quality(budget.min_psnr or 0.0, budget.min_ssim or 0.0), file)
 
         def tried(count: int) -> Splats:
@@ -182,12 +184,12 @@ class Reduction:
                 splats = splats.with_sh_degree(sh_degree)
             exact = self.plan is not None and scene_format(file).suffix == ".ply"
             most = int(size * _BYTES_SAFETY) if self.recovered and not exact else size
-            try_it = None if self.given.rough else tried
+            try_it = None if rough else tried
             found = find_count_for_bytes(splats, most, file, try_it, None if self.plan is None else total)
         else:
             found = budget.of(total, name)
             check_positions(file, splats, found)
-        if budget.layers is not None and not self.given.rough:
+        if budget.layers is not None and not rough:
             before = found
             found, layers = find_count_for_layers(before, budget.layers, tried)
             if found < before:
@@ -196,9 +198,12 @@ class Reduction:
                     f"{before:,}, {layers:.0f} at {found:,}"
                 )
         if budget.fit is not None:
-            fits = plural(found, "Gaussian") if size is None else f"about {plural(found, 'Gaussian')}"
-            all_fit = f"nothing to do, all {plural(found, 'Gaussian')} already fit"
-            say(f"{budget.fit}: {all_fit if found == total else fits}")
+            fits = plural(found, "Gaussian")
+            if found == total:
+                fits = f"nothing to do, all {fits} already fit"
+            elif size is not None:
+                fits = f"about {fits}"
+            say(f"{budget.fit}: {fits}")
         return ResolvedBudget(found, size, file)
 
     def _resolve_for_quality(self, wanted: Quality, file: str) -> ResolvedBudget:
@@ -227,9 +232,7 @@ class Reduction:
         renders = [drawn[view] for view in range(len(cameras))]
         found, near = find_count_for_quality(renders, self.total, wanted, cameras, reduce)
         if found == self.total:
-            self.given.say(
-                f"no smaller count was found that keeps the quality; keeping all {found:,} Gaussians"
-            )
+            say(f"no smaller count was found that keeps the quality; keeping all {found:,} Gaussians")
         else:
             stage = " before recovery" if self.recovered else ""
             views = plural(len(cameras), "view")
@@ -254,7 +257,6 @@ def open_reduction(
     scene: Splats | Source,
     tiling: Tiling | None = None,
     *,
-    planned: bool = False,
     counted: Callable[[int], None] = lambda total: None,
     given: GivenViews,
     **options: Any,
@@ -262,8 +264,8 @@ def open_reduction(
     """Read a scene to be simplified, see `simplify`, or open its tiles.
 
     Args:
-        tiling: how to process the scene, a file, in tiles; None for one piece.
-        planned: whether tiles are only planned.
+        tiling: how to process the scene, a file, in tiles, which are only planned if `given` is rough; None
+            for one piece.
         counted: called with the number of Gaussians before any work on them.
         options: other fields of `Reduction`.
     """
@@ -278,7 +280,7 @@ def open_reduction(
         from g2ard.jobs.dense import open_tiles
 
         config = options["config"]
-        with open_tiles(scene, tiling, 1.0, config, planned=planned, progress=progress, say=say) as tiles:
+        with open_tiles(scene, tiling, 1.0, config, planned=given.rough, progress=progress, say=say) as tiles:
             counted(tiles.plan.count)
             yield Reduction(tiles.dense, given, notes=tiles.notes, plan=tiles.plan, **options)
         return

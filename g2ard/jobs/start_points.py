@@ -8,7 +8,7 @@ import numpy as np
 
 from g2ard.config.choices import Colour
 from g2ard.errors import G2ardError
-from g2ard.io import Source, read_cloud
+from g2ard.io import Source
 from g2ard.io.detect import file_format
 from g2ard.io.finding import Finder
 from g2ard.io.jsonfile import read_json
@@ -100,13 +100,8 @@ def _measure_shown_share(cameras: Cameras, view: int) -> float:
     return float((shown if mask is None else shown & mask).mean())
 
 
-def read_seen_points(train: Cameras, file: Path) -> Cloud:
-    """Read the points of `find_sparse_file` that training views see, as far as the file states who does."""
-    return keep_seen_points(Source(file), train).cloud(bare=True).whole()
-
-
 def keep_seen_points(scene: Source, train: Cameras) -> Source:
-    """Return points without those that the file says fewer than two training views see."""
+    """Return points without those that fewer than two training views see, if the file says who sees them."""
     if scene.format != "points3d":
         return scene
     import g2ard.io.points3d as points3d
@@ -124,7 +119,8 @@ def keep_seen_points(scene: Source, train: Cameras) -> Source:
 
 def colored_source(scene: Source, train: Cameras, *, planned: bool) -> Source:
     """Return a point cloud without colours with those of training photos, block by block."""
-    found, chosen = Source(scene.path, None, [other.path for other in scene.others]), scene.through
+    found = Source(scene.path, None, [other.path for other in scene.others])
+    chosen = scene.through
 
     def through(stream: PointStream) -> PointStream:
         stream = chosen(stream) if chosen else stream
@@ -150,7 +146,9 @@ def read_sparse_points(file: Path | None, say: Say = unsaid, train: Cameras | No
     try:
         if file is None:
             return None
-        cloud = read_cloud(file, bare=True) if train is None else read_seen_points(train, file)
+        source = Source(file)
+        seen = source if train is None else keep_seen_points(source, train)
+        cloud = seen.cloud(bare=True).whole()
     except G2ardError as error:
         say(f"warning: no starting points from photos: {error}")
         return None
@@ -172,15 +170,14 @@ def find_sparse_file(views: Views) -> Path | None:
         return None
     path = Path(given)
     found = file_format(path)
-    folder = path if path.is_dir() else path.parent
-    if found == "colmap":
-        return colmap.points_file(path)
     if found == "gsplat_run":
         data = gsplat_run.data_of(path)
         return data and colmap.points_file(data)
+    if found == "colmap":
+        return colmap.points_file(path)
     if found == "inria":
-        input_file = folder / "input.ply"
-        return input_file if input_file.is_file() else None
+        file = (path if path.is_dir() else path.parent) / "input.ply"
+        return file if file.is_file() else None
     if found != "transforms":
         return None
     file = path if path.is_file() else next(iter(transforms.files_of(path)))

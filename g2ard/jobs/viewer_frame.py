@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -21,7 +23,7 @@ from g2ard.scene.samples import take_evenly
 from g2ard.scene.splats import Splats
 from g2ard.scene.transform import change_of_axes, quaternion_of, transform, unit_up, up_in
 from g2ard.stages.recover.anchors import measure_prior
-from g2ard.viewer.page import Start
+from g2ard.viewer.page import Start, write_page
 
 _SAMPLE = 100_000
 """Gaussians used to estimate the up direction, or to recognise a lift."""
@@ -65,6 +67,13 @@ class ViewerFrame:
         turn = np.eye(4)
         turn[:3, :3] = self.rotation
         return transform(replace(splats.recentred(self.origin), offset=np.zeros(3), axes="RDF"), turn)
+
+    def write_page(
+        self, path: Path, labels: Sequence[str], scenes: Sequence[Splats], **options: Any
+    ) -> tuple[int, tuple[int, ...]]:
+        """Write a page of scenes that opens at the initial camera, see `g2ard.viewer.page.write_page`."""
+        turned = [(label, self.of(scene)) for label, scene in zip(labels, scenes, strict=True)]
+        return write_page(path, turned, start=self.start, **options)
 
     def place(self, offset: Float, axes: Axes = "RDF") -> tuple[list[float], list[float]]:
         """Return quaternion x y z w and translation that put the files of a scene with this offset and these

@@ -110,7 +110,8 @@ class InTiles:
         merged = simplify_tiles(self._run, count, views, final_budget)
         if count > self.most_rows:
             return merged
-        small, report = load_whole(merged.splats), merged.report
+        small = load_whole(merged.splats)
+        report = merged.report
         if views is None or count == self.total:
             return replace(merged, splats=small)
         usual = usual_and_others(views)[0].resized(LONGEST)
@@ -138,7 +139,8 @@ class InTiles:
     def opacity_lost(self, result: Splats, views: Cameras) -> float:
         """Return the share of light that a result lets through."""
         some = some_views(views)
-        drawn, renderer = TileRenders(self, some, opacity=True), Renderer(result, settings=self.settings)
+        drawn = TileRenders(self, some, opacity=True)
+        renderer = Renderer(result, settings=self.settings)
         pairs = [
             let_through(drawn[view][..., 3], renderer.render(camera).alpha)
             for view, camera in enumerate(some)
@@ -197,7 +199,9 @@ class TileRenders(Cached):
         opacity: bool = False,
     ) -> None:
         super().__init__(cameras, limit)
-        self._scene, self._background, self._opacity = scene, tuple(background), opacity
+        self._scene = scene
+        self._background = tuple(background)
+        self._opacity = opacity
         self._files: dict[int, Path] = {}
 
     def _given(self) -> Sequence[Any]:

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import ExitStack, closing, contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache, partial
 from multiprocessing import get_context, parent_process
 from pathlib import Path
@@ -151,12 +151,14 @@ def run_here(tasks: Sequence[Task], told: Told) -> None:
         told(task, 1.0)
 
 
+@dataclass(eq=False)
 class _Cluster:
     """A connection to a Dask scheduler, which is asked from time to time whether it has workers."""
 
-    def __init__(self, scheduler: str, client: Any) -> None:
-        self.scheduler = scheduler
-        self.client = client
+    scheduler: str
+    client: Any
+
+    def __post_init__(self) -> None:
         self._asked = self._manned = time.monotonic()
 
     def check(self) -> None:
@@ -186,23 +188,18 @@ class _Cluster:
         ) from None
 
 
+@dataclass(eq=False)
 class _Pool:
     """A pool of processes or of Dask's workers, opened again after one of them is killed.
 
     Results are what workers tell of themselves, because Dask cannot spill what they hold in Rust's memory.
     """
 
-    def __init__(
-        self,
-        opened: Callable[[], concurrent.futures.Executor],
-        threads: int,
-        cluster: _Cluster | None = None,
-    ):
-        self._opened = opened
-        self._threads = threads
-        self._cluster = cluster
-        self._lanes: dict[str, str] = {}  # instruction set → one worker that has it
-        self._pool: concurrent.futures.Executor | None = None
+    _opened: Callable[[], concurrent.futures.Executor]
+    _threads: int
+    _cluster: _Cluster | None = None
+    _lanes: dict[str, str] = field(default_factory=dict)  # instruction set → one worker that has it
+    _pool: concurrent.futures.Executor | None = None
 
     def run(self, tasks: Sequence[Task], told: Told) -> None:
         try:

@@ -23,7 +23,10 @@ from g2ard.progress import Progress, Say, plural, silent, unsaid
 from g2ard.stages.lift import LiftConfig, guessed_axes
 from g2ard.system.keys import key_of
 from g2ard.tiles.executor import Executor, run_here
-from g2ard.tiles.writer import Pouring, clear, is_tile_file
+from g2ard.tiles.writer import Pouring, Stream, clear, is_tile_file
+
+Given = str | Path | Source | Sequence[str | Path] | SceneStream
+"""One or more files of scenes or point clouds, or a scene."""
 
 TILE_ROWS = 5_000_000
 """Default largest number of rows per tile."""
@@ -34,7 +37,7 @@ MOST_TILES = 10_000
 
 @checks_arguments
 def ingest(
-    source: str | Path | Source | Sequence[str | Path] | SceneStream,
+    source: Given,
     folder: str | Path,
     *,
     tile_rows: int = TILE_ROWS,
@@ -153,31 +156,27 @@ def ingest(
 
 
 def _manifest(
-    stream: SceneStream | PointStream,
-    sources: list[str],
-    settings: Named,
-    notes: list[Note],
-    progress: Progress,
+    stream: Stream, sources: list[str], settings: Named, notes: list[Note], progress: Progress
 ) -> Named:
     """Describe what the tiles hold."""
-    scene = stream if isinstance(stream, SceneStream) else None
-    manifest = {
-        "sh_degree": scene.sh_degree if scene else 0,
-        "render_model": scene.render_model if scene else "classic",
+    if isinstance(stream, PointStream):
+        drawn: Named = {"sh_degree": 0, "render_model": "classic"}
+        axes = stream.axes or guessed_axes(stream.sample, progress)
+        stated: Named = {"axes": axes, "system": stream.system}
+    else:
+        drawn = {"sh_degree": stream.sh_degree, "render_model": stream.render_model}
+        stated = {"axes": stream.axes, "up": stream.up}
+    return {
+        **drawn,
         "offset": stream.offset.tolist(),
         "source": sources,
         "settings": settings,
         "notes": [asdict(note) for note in notes],
+        **{name: value for name, value in stated.items() if value is not None},
     }
-    if isinstance(stream, PointStream):
-        system = {} if stream.system is None else {"system": stream.system}
-        return {**manifest, "axes": stream.axes or guessed_axes(stream.sample, progress), **system}
-    return {**manifest, "axes": stream.axes} | ({} if stream.up is None else {"up": stream.up})
 
 
-def _opened(
-    source: str | Path | Source | Sequence[str | Path] | SceneStream, render_model: RenderModel | None
-) -> tuple[SceneStream | PointStream, list[str]]:
+def _opened(source: Given, render_model: RenderModel | None) -> tuple[Stream, list[str]]:
     """Open a source, and return the names of its files."""
     if isinstance(source, SceneStream):
         return source, [str(source.path)]

@@ -244,7 +244,8 @@ def merge(given: Given) -> Arrays:
     out = _seen_tile(scene, given).assemble(of, len(clusters))
     small = splats_of(scene, out)
     if faint := np.flatnonzero(dropped)[: given["faint"]].tolist():
-        of[faint], dropped[faint] = np.arange(len(small), len(small) + len(faint)), False
+        of[faint] = np.arange(len(small), len(small) + len(faint))
+        dropped[faint] = False
         small = join([small, scene.take(scene.core.order[faint])])
     parents = np.empty(len(scene), np.int32)
     parents[scene.core.order] = of.view(np.int32)  # GONE is −1

@@ -364,7 +364,9 @@ def cut(given: Given) -> Arrays:
         if isinstance(stream, PointStream):
             far, colors = block
             points = np.empty(len(far), _POINT_DTYPE)
-            points["near"], points["rgb"], points["far"] = stream.near(far), colors, far
+            points["near"] = stream.near(far)
+            points["rgb"] = colors
+            points["far"] = far
             blocks.append(points)
         else:
             blocks.append(packed(block))

@@ -52,14 +52,12 @@ def compare(
     from g2ard.rendering.targets import TeacherRenders
     from g2ard.scene.cameras import Cameras
     from g2ard.stages.evaluate import evaluate
-    from g2ard.viewer.page import write_page
 
     if is_given(views):
         run.refuse_typed("on given views", "looks")
     (first, second), roles = put_dense_first(first, second)
     sources = [Source(path, run.render_model) for path in (first, second)]
-    if output is not None:
-        run.claim_file("--output", output, page=True)
+    run.claim_file("--output", output, page=True)
     dense, other = (run.load(source) for source in sources)
     known = opt.background_of(run, background, first, second)
     colour = known or BLACK
@@ -111,19 +109,17 @@ def compare(
                 camera = cameras[cameras.names.index(name)]
                 stops.append((f"{what}: {name}, {psnr[name]:.1f} dB", stand.start_at(camera, points)))
             labels = label_scenes(sources, [len(dense), len(other)], roles)
-            scenes = [(label, stand.of(splats)) for label, splats in zip(labels, (dense, other), strict=True)]
-            write_page(
+            scenes = [dense, other]
+            stand.write_page(
                 output,
+                labels,
                 scenes,
-                start=stand.start,
                 stops=stops,
-                background=choose_backdrop(
-                    known, [dense, other], of_points=is_made_of_points(first, sources[0])
-                ),
+                background=choose_backdrop(known, scenes, of_points=is_made_of_points(first, sources[0])),
                 overwrite=run.overwrite,
                 progress=run.progress,
             )
-            run.kept.append(f"{output} is written")
+            run.note_written(output)
             run.say(f"{output}: opens at {stand.name}; the arrows below lead to the worst views")
     closer = _name_closer(run, first, second, dense, other, colour)
     if closer is not None:

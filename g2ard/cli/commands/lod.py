@@ -225,7 +225,7 @@ def lod(
             stated = source.metres_per_unit or 0.0
             unit = unit or next((name for name, metres in UNITS.items() if abs(metres - stated) < 1e-7), None)
             written = save_tileset(output, levels.splats, up=axis, place=spot, unit=unit, **common)
-        run.kept.append(f"{output} is written")
+        run.note_written(output)
         frame = GivenViews(views, scene, axis)
         with run.showing("the page"):
             written += write_level_page(
@@ -243,9 +243,10 @@ def _tell_costs(run: Run, job: LevelsJob) -> None:
     from g2ard.cli.run_result import describe_memory, describe_steps
 
     levels = []
-    for number, (ratio, count, cost) in enumerate(zip(job.ratios, job.counts, job.costs, strict=True)):
+    for number, (ratio, count, size) in enumerate(job.plan()):
         if ratio == 1:
             continue
+        cost = job.cost_of(count, size)
         steps = f", {describe_steps(cost)}" if job.job.recovers else ""
         run.answer(f"level {number}: {plural(count, 'Gaussian')}{steps}: roughly {describe_memory(cost)}")
         levels.append({"level": number, "count": count, **asdict(cost)})

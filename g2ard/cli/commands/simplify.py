@@ -123,7 +123,6 @@ def simplify(
     opening = open_reduction(
         source,
         how,
-        planned=dry_run,
         counted=counted,
         given=GivenViews(given, None, up, run.seed, rough=dry_run, **run.callbacks),
         blind=no_views,
@@ -149,7 +148,8 @@ def simplify(
                     np.save(file, read_parents(small, source))
             written = time.perf_counter()
             seconds = {"read": reading, "simplify": simplified - started, "write": written - simplified}
-            seconds["total"], started = sum(seconds.values()), written
+            seconds["total"] = sum(seconds.values())
+            started = written
             warnings = reduce.warnings(small.splats)
             reports.append(
                 {

@@ -102,7 +102,6 @@ def _write(
     from g2ard.jobs.comparison import is_made_of_points, put_dense_first
     from g2ard.jobs.inputs import GivenViews
     from g2ard.jobs.viewer_frame import choose_backdrop, choose_frame
-    from g2ard.viewer.page import write_page
 
     views = opt.with_images(given, images)
     run.claim_file("--output", output, page=True)
@@ -116,15 +115,15 @@ def _write(
     known = opt.background_of(run, background, scene, other)
     opened = sources[shown.index(scene)]
     run.begin("page")
-    written, scene_sizes = write_page(
+    written, scene_sizes = stand.write_page(
         output,
-        [(label, stand.of(splats)) for label, splats in zip(labels, loaded, strict=True)],
-        start=stand.start,
+        labels,
+        loaded,
         background=choose_backdrop(known, loaded, of_points=is_made_of_points(scene, opened)),
         overwrite=run.overwrite,
         progress=run.progress,
     )
-    run.kept.append(f"{output} is written")
+    run.note_written(output)
     sizes = " and ".join(f"{size / 1e6:.2f}" for size in scene_sizes)
     run.say(f"{output}: {' | '.join(labels)}; {sizes} MB as SOG, {written / 1e6:.2f} MB in all")
     run.result(
