@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import threading
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -44,6 +45,9 @@ _VIEWS_PER_TASK = 32
 
 _KEPT_BYTES = 500_000_000
 """Default of `TileRenders.limit`."""
+
+_DRAWING = threading.Lock()
+"""Held while views are drawn: workers first remove temporary files, which another thread may be writing."""
 
 
 @dataclass(eq=False)
@@ -214,9 +218,11 @@ class TileRenders(Cached):
     def fill(self, progress: Progress, views: Sequence[int] | None = None) -> None:
         """Draw the views, all by default, that are not drawn yet."""
         views = range(len(self.cameras)) if views is None else views
-        missing = [int(view) for view in views if view not in self._files]
-        if not missing:
-            return
+        with _DRAWING:
+            if missing := [int(view) for view in views if view not in self._files]:
+                self._draw(missing)
+
+    def _draw(self, missing: Sequence[int]) -> None:
         store = self._scene.store
         workers = self._scene.workers
         positions = self.cameras.positions - store.offset

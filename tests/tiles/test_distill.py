@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -208,6 +209,8 @@ def test_tiles_draw_the_images_of_the_whole_scene(folder: Path, tmp_path: Path) 
         settings = tiles.settings
         whole = TeacherRenders(scene, views, background=(0.2, 0.4, 0.6), settings=settings)
         drawn = tiles.images(views, (0.2, 0.4, 0.6))
+        with ThreadPoolExecutor(8) as threads:  # which all find that nothing is drawn
+            list(threads.map(drawn.__getitem__, range(len(views))))
         for view in range(len(views)):
             np.testing.assert_allclose(drawn[view], whole[view], atol=1 / 255)
             assert np.abs(drawn[view] - whole[view]).mean() < 2e-5
