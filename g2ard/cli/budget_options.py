@@ -117,7 +117,7 @@ BUDGET_FLAGS = "-n COUNT, -r RATIO, --fit, or --min-psnr and --min-ssim"
 """Options of a budget, for messages."""
 
 Options = dict[str, tuple[Any, ...]]
-"""Name → type and option, then a default unless it is None."""
+"""Name → type and option, followed by the default of an option that has one."""
 
 BUDGETS: Options = {
     "count": (

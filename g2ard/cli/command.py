@@ -195,7 +195,7 @@ def command(
 
 
 def _create_parameter(name: str, kind: Any, option: Any, default: Any = None) -> inspect.Parameter:
-    """Return the parameter of an option, which is None without a default."""
+    """Return the parameter of an option. Without a default its type also allows None."""
     if default is None:
         kind = kind | None
     annotation = Annotated[kind, option]

@@ -144,11 +144,10 @@ def cost_of_cleaning(scene: SceneStream, kinds: Sequence[str]) -> Cost:
 
 def _peak_bytes(job: DistillJob, count: int, page: bool, *, trains: bool) -> int:
     """Return the peak memory: of simplification, of recovery, or of what is written at the end."""
-    given = job.config.recover.sh_degree
     views = job.views
     train = job.views.train.cameras
     count = plan_round_counts(job.dense, count, job.config)[0]
-    degree = job.prior.sh_degree if given is None else given
+    degree = job.sh_degree
     dense = len(job.prior)
     scene = job.prior.nbytes
     small = 4 * row_width(degree) * count
@@ -199,7 +198,8 @@ def check_job_memory(job: DistillJob, most: int | None, need: int) -> None:
         largest = plan_round_counts(job.dense, job.budget.count, job.config)[0]
         what = f"recovering {plural(largest, 'Gaussian')} takes"
     message = f"--memory: {what} about {format_bytes(need, ceil=True)}, more than {format_bytes(most)}"
-    message += "; fewer Gaussians, a lower --sh-degree and smaller views, --size, take less"
+    lower = ", a lower --sh-degree" if job.sh_degree else ""
+    message += f"; fewer Gaussians{lower} and smaller views, --size, take less"
     if job.plan is None and job.renders:  # tiles support this job
         tiles = TileMemory(count, 4 * row_width(job.prior.sh_degree), RECOVERY_TIMES)
         message += f"; in tiles {tiles.advice(most, max(1, count // 2))}"

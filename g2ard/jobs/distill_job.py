@@ -75,6 +75,12 @@ class DistillJob:
         return self.dense.total
 
     @property
+    def sh_degree(self) -> int:
+        """SH degree of the result."""
+        given = self.config.recover.sh_degree
+        return self.prior.sh_degree if given is None else given
+
+    @property
     def renders(self) -> bool:
         """Whether any target may be a render of the dense scene."""
         return self.teaching.render is not None

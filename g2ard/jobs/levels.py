@@ -157,9 +157,7 @@ class LevelsJob:
         job = replace(self.job, views=replace(self.job.views.resized(size), full=None))
         held_out = job.targets.held_out
         fill(held_out, job.progress)
-        degree = job.config.recover.sh_degree
-        degree = job.prior.sh_degree if degree is None else degree
-        fits = job.plan is None or trainer_bytes(count, degree) <= job.plan.memory
+        fits = job.plan is None or trainer_bytes(count, job.sh_degree) <= job.plan.memory
         if job.recovers and fits:
             done = job.reduce(finer, count, work)
             lost = job.dense.opacity_lost(done.splats, held_out.cameras)

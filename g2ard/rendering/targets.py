@@ -13,6 +13,7 @@ from typing import Any, ClassVar, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from g2ard.arrays import Float, Float32, Mask, Values
 from g2ard.config.checks import checks_arguments
 from g2ard.config.choices import BLACK, Colour
 from g2ard.errors import InputError, require
@@ -39,16 +40,16 @@ class Targets(Protocol):
 
     cameras: Cameras
 
-    def __getitem__(self, view: int) -> NDArray[np.float32]: ...
+    def __getitem__(self, view: int) -> Float32: ...
 
 
-def mask_of(targets: Targets, view: int) -> NDArray[np.bool_] | None:
+def mask_of(targets: Targets, view: int) -> Mask | None:
     """Return the (H, W) mask of a target's valid pixels, or None if all are valid."""
     masks = getattr(targets, "mask", None)
     return None if masks is None else masks(view)
 
 
-def alpha_of(targets: Targets, view: int) -> NDArray[np.float32] | None:
+def alpha_of(targets: Targets, view: int) -> Float32 | None:
     """Return the (H, W) alpha of a photo that was composited, or None."""
     alphas = getattr(targets, "alpha", None)
     return None if alphas is None else alphas(view)
@@ -224,15 +225,15 @@ class _Chosen(_Sourced):
         for targets, rows in self._parts(views):
             fill(targets, progress, rows)
 
-    def __getitem__(self, view: int) -> NDArray[np.float32]:
+    def __getitem__(self, view: int) -> Float32:
         targets, row = self._places[view]
         return targets[row]
 
-    def mask(self, view: int) -> NDArray[np.bool_] | None:
+    def mask(self, view: int) -> Mask | None:
         """Return the mask, see `mask_of`."""
         return mask_of(*self._places[view])
 
-    def alpha(self, view: int) -> NDArray[np.float32] | None:
+    def alpha(self, view: int) -> Float32 | None:
         """Return the alpha, see `alpha_of`."""
         return alpha_of(*self._places[view])
 
@@ -268,7 +269,7 @@ class _Converted(_Chosen):
         """Return a hash of the converted images."""
         return [_hash_content(self)]
 
-    def __getitem__(self, view: int) -> NDArray[np.float32]:
+    def __getitem__(self, view: int) -> Float32:
         try:
             image = super().__getitem__(view)
         except IndexError:
@@ -278,7 +279,7 @@ class _Converted(_Chosen):
         return _as_floats(array)
 
 
-def _as_floats(image: NDArray[Any]) -> NDArray[np.float32]:
+def _as_floats(image: Values) -> Float32:
     """Return an image as contiguous float32, divided by 255 if it has bytes."""
     scaled = image.astype(np.float32) / np.float32(255) if image.dtype == np.uint8 else image
     return np.ascontiguousarray(scaled, np.float32)
@@ -314,7 +315,7 @@ class Cached(_Sourced, Shown):
         require("limit", limit, limit >= 0, "at least 0 bytes")
         self.cameras = cameras
         self._limit = limit
-        self._kept: dict[tuple[str, int], NDArray[Any] | None] = {}
+        self._kept: dict[tuple[str, int], Values | None] = {}
         self._bytes = 0
         self._spill = Spill()
 
@@ -322,13 +323,13 @@ class Cached(_Sourced, Shown):
         return f"{type(self).__name__}({plural(len(self.cameras), 'view')})"
 
     @abstractmethod
-    def _make(self, view: int) -> NDArray[Any]:
+    def _make(self, view: int) -> Values:
         """Create the image of one view, as it is cached."""
 
     def fill(self, progress: Progress, views: Sequence[int] | None = None) -> None:
         """Make images before they are drawn, if that takes long; see `fill`."""
 
-    def _stored(self, view: int) -> NDArray[Any]:
+    def _stored(self, view: int) -> Values:
         return self._cached("image", view, self._make)
 
     def _holds(self, view: int) -> bool:
@@ -385,10 +386,10 @@ class Photos(Cached):
     def __init__(
         self,
         cameras: Cameras,
-        images: Sequence[Any] | NDArray[Any] | None = None,
+        images: Sequence[Any] | Values | None = None,
         *,
         background: Colour = BLACK,
-        exposures: Mapping[str, NDArray[np.float64]] | None = None,
+        exposures: Mapping[str, Float] | None = None,
         limit: int = CACHE_BYTES,
     ) -> None:
         self._images: list[Any] | None = None
@@ -428,21 +429,21 @@ class Photos(Cached):
         """Return the kind, see `against_of`."""
         return "photo"
 
-    def mask(self, view: int) -> NDArray[np.bool_] | None:
+    def mask(self, view: int) -> Mask | None:
         """Return the mask of valid pixels, or None."""
-        mask: NDArray[np.bool_] | None = self._cached("mask", view, partial(load_mask, self.cameras))
+        mask: Mask | None = self._cached("mask", view, partial(load_mask, self.cameras))
         return mask
 
-    def alpha(self, view: int) -> NDArray[np.float32] | None:
+    def alpha(self, view: int) -> Float32 | None:
         """Return the alpha, see `alpha_of`."""
-        alpha: NDArray[np.float32] | None = self._cached("alpha", view, self._alpha)
+        alpha: Float32 | None = self._cached("alpha", view, self._alpha)
         return alpha
 
-    def _alpha(self, view: int) -> NDArray[np.float32] | None:
+    def _alpha(self, view: int) -> Float32 | None:
         own = load_photo(self.cameras, view, None)[0] if self._images is None else self._images[view]
         return _as_floats(own)[..., 3].copy() if own.shape[2] == 4 else None
 
-    def _stored(self, view: int) -> NDArray[Any]:
+    def _stored(self, view: int) -> Values:
         if self._images is not None and self._images[view].shape[2] == 3:
             return self._images[view]  # in memory anyway
         return super()._stored(view)
@@ -454,7 +455,7 @@ class Photos(Cached):
         self._cached("mask", view, lambda _: mask)
         return np.rint(image * 255).astype(np.uint8)
 
-    def __getitem__(self, view: int) -> NDArray[np.float32]:
+    def __getitem__(self, view: int) -> Float32:
         photo = _as_floats(self._stored(view))
         undo = self._undo.get(view)
         if undo is not None:
@@ -466,7 +467,7 @@ class Photos(Cached):
         return photo
 
 
-def _composite(image: NDArray[Any], background: Colour) -> NDArray[np.float32]:
+def _composite(image: Values, background: Colour) -> Float32:
     """Composite an image with alpha over the background."""
     floats = _as_floats(image)
     colour = np.array(background, np.float32)
@@ -477,13 +478,13 @@ _RENDER_LEVELS = np.float32(65_535)
 """Largest value of a render rounded to 16 bits."""
 
 
-def rounded(image: NDArray[np.float32]) -> NDArray[np.uint16]:
+def rounded(image: Float32) -> NDArray[np.uint16]:
     """Round a render in [0, 1] to 16 bits, in place."""
     image *= _RENDER_LEVELS
     return np.rint(image, out=image).astype(np.uint16)
 
 
-def unrounded(image: NDArray[np.uint16]) -> NDArray[np.float32]:
+def unrounded(image: NDArray[np.uint16]) -> Float32:
     """Return the render that `rounded` stored."""
     return np.multiply(image, 1 / _RENDER_LEVELS, dtype=np.float32)
 
@@ -554,7 +555,7 @@ class TeacherRenders(Cached):
         """Return the kind, see `against_of`."""
         return "teacher"
 
-    def __getitem__(self, view: int) -> NDArray[np.float32]:
+    def __getitem__(self, view: int) -> Float32:
         return unrounded(self._stored(view))
 
 
@@ -576,7 +577,7 @@ class PhotosOrRenders(_Chosen):
         teacher: Splats | Callable[[Cameras], Targets],
         *,
         background: Colour = BLACK,
-        exposures: Mapping[str, NDArray[np.float64]] | None = None,
+        exposures: Mapping[str, Float] | None = None,
         limit: int = CACHE_BYTES,
         **renders: Any,
     ) -> None:
@@ -593,7 +594,7 @@ class PhotosOrRenders(_Chosen):
         super().__init__(cameras, places)
 
 
-def _invert_exposure(name: str, exposure: NDArray[np.float64]) -> NDArray[np.float32]:
+def _invert_exposure(name: str, exposure: Float) -> Float32:
     """Return the (3, 4) transform from the photo `name` to a render, from its exposure (render to photo)."""
     matrix = np.asarray(exposure, np.float64)
     if matrix.shape != (3, 4) or not np.isfinite(matrix).all() or abs(np.linalg.det(matrix[:, :3])) < 1e-6:

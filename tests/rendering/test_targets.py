@@ -160,7 +160,7 @@ def test_a_target_from_the_file_can_be_changed() -> None:
     np.testing.assert_array_equal(targets[0], first)
 
 
-@pytest.mark.skipif(not Path("/proc/self/fd").exists(), reason="reads /proc")
+@pytest.mark.skipif(not Path("/proc/self/fd").exists(), reason="open files cannot be counted on this system")
 def test_the_file_disappears_with_its_targets() -> None:
     def opened() -> int:
         return len(list(Path("/proc/self/fd").iterdir()))

@@ -13,9 +13,10 @@ from threading import Event
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 import g2ard.stages.recover.checkpoint as checkpoints
+from g2ard.arrays import Float, Int, Mask
 from g2ard.errors import DeviceError, InputError, require, require_torch
 from g2ard.progress import Progress, silent
 from g2ard.rendering.exposure import exposures_of, unexposed
@@ -81,12 +82,12 @@ class Loop:
     student: Splats
     targets: Targets
     config: RecoverConfig
-    weights: NDArray[np.float64] | None
+    weights: Float | None
     anchors: Anchors
     probe: Probe = field(metadata=UNKEYED)
     guard: Guard = field(metadata=UNKEYED)
     validation_key: str | None
-    frozen: NDArray[np.bool_] | None
+    frozen: Mask | None
     time_left: Callable[[], float] | None = field(default=None, metadata=UNKEYED)
     limit: float | None = field(default=None, metadata=UNKEYED)
     multiplier: float = field(default=1.0, metadata=UNKEYED)
@@ -99,8 +100,8 @@ class Loop:
     geometry: list[dict[str, float]] = field(default_factory=list, metadata=UNKEYED)
     skipped_before: int = field(default=0, metadata=UNKEYED)
     tally: list[list[float]] = field(default_factory=lambda: [[0, 0.0], [0, 0.0]], metadata=UNKEYED)
-    exposures: NDArray[np.float64] | None = field(default=None, metadata=UNKEYED)
-    _epoch: tuple[int, NDArray[np.int64]] | None = field(default=None, metadata=UNKEYED)
+    exposures: Float | None = field(default=None, metadata=UNKEYED)
+    _epoch: tuple[int, Int] | None = field(default=None, metadata=UNKEYED)
 
     def __post_init__(self) -> None:
         self.schedule = self.config.schedule.within(self.targets.cameras.extent)
@@ -223,7 +224,7 @@ class Loop:
 
     def run(
         self, checkpoint: Path | None, progress: Progress, stage: str, watch: Watch | None
-    ) -> tuple[Splats, NDArray[np.float64] | None]:
+    ) -> tuple[Splats, Float | None]:
         """Take all steps, after those of a checkpoint if it exists.
 
         Return the scene, and with validation views the (N,) number of views that each Gaussian was seen in,
@@ -254,7 +255,7 @@ class Loop:
                 self.seconds = seconds
                 self.resumed = resumed
 
-    def _estimate_seen(self) -> NDArray[np.float64]:
+    def _estimate_seen(self) -> Float:
         """Estimate the (N,) number of views that each Gaussian was seen in from its steps."""
         backed_off = self.guard.backed_off
         first = int(backed_off[-1]["step"]) if backed_off else 0
@@ -413,7 +414,7 @@ def _import_engine(name: str) -> type[Engine]:
     return TorchEngine
 
 
-def check_weights(weights: ArrayLike | None, count: int) -> NDArray[np.float64] | None:
+def check_weights(weights: ArrayLike | None, count: int) -> Float | None:
     """Check the weights of `count` views and return them with mean 1; None stays None.
 
     Raises:
@@ -432,9 +433,7 @@ def check_weights(weights: ArrayLike | None, count: int) -> NDArray[np.float64] 
     return values / values.mean()
 
 
-def draw_views(
-    seed: int, epoch: int, count: int, weights: NDArray[np.float64] | None = None
-) -> NDArray[np.int64]:
+def draw_views(seed: int, epoch: int, count: int, weights: Float | None = None) -> Int:
     """Return the `count` views of an epoch, in a random order that depends only on the arguments.
 
     Without weights, every view appears once. With (count,) weights w from `check_weights`, view v appears

@@ -243,7 +243,8 @@ impl PyTrainer {
             Some("values") => Some(Part::Values),
             Some("first") => Some(Part::First),
             Some("second") => Some(Part::Second),
-            Some(_) => Some(Part::Rest),
+            Some("rest") => Some(Part::Rest),
+            Some(other) => return Err(invalid("part", "values, first, second or rest", other)),
         };
         let trained = work::locked(py, &self.trained);
         let state = work::quick(py, || {
