@@ -44,7 +44,9 @@ def read(folder: Path) -> ViewSet:
                 distortion = (-radial, 0.0, 0.0, 0.0, 0.0)
                 own = Lens.pinhole((width, height), (focal, focal), distortion=distortion)
                 frames.append(Frame(name, viewmat, own, folder / name, split, listed=name))
-    text = f"{guessed} views are not in {model.name}; they get the median focal length, {median:.1f}"
+    text = (
+        f"{guessed} views are not in {model.name}; they get the median focal length, {median:.1f}"
+    )
     return make_view_set(Listed(folder, frames).noted("guessed_focal", guessed, text))
 
 
@@ -74,6 +76,8 @@ def _lenses(path: Path) -> dict[str, tuple[float, float]]:
 
     A line holds name, focal length, quaternion, centre, radial parameter and 0, after the number of lines.
     """
-    lines = [line.split() for line in path.read_text(encoding="utf-8").splitlines()[1:] if line.strip()]
+    lines = [
+        line.split() for line in path.read_text(encoding="utf-8").splitlines()[1:] if line.strip()
+    ]
     count = int(lines[0][0])
     return {_stem(row[0]): (float(row[1]), float(row[9])) for row in lines[1 : count + 1]}

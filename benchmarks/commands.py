@@ -49,17 +49,21 @@ def run_(
             help="Studies: .toml files, or names in benchmarks/definitions. Scenes replace theirs.",
         ),
     ],
-    output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Folder of the run.")] = Path(
-        "figures"
-    ),
-    views: Annotated[Path | None, typer.Option(metavar="VIEWS", help="Of the scenes given.")] = None,
+    output: Annotated[
+        Path, typer.Option("-o", "--output", metavar="DIR", help="Folder of the run.")
+    ] = Path("figures"),
+    views: Annotated[
+        Path | None, typer.Option(metavar="VIEWS", help="Of the scenes given.")
+    ] = None,
     held_out: Annotated[
         Path | None, typer.Option(metavar="VIEWS", help="Score on these; --views is to train on.")
     ] = None,
     photos: Annotated[
         bool, typer.Option("--photos", help="Targets are the photos, not the scenes' renders.")
     ] = False,
-    only: Annotated[str | None, typer.Option(metavar="NAMES", help="Of the studies' scenes.")] = None,
+    only: Annotated[
+        str | None, typer.Option(metavar="NAMES", help="Of the studies' scenes.")
+    ] = None,
     methods: _List = None,
     ratios: _List = None,
     seeds: _List = None,
@@ -82,14 +86,22 @@ def run_(
     from benchmarks.study import DEFINITIONS, SceneSpec, read_study, scene_label
     from g2ard.io import kind
 
-    named = [Path(word) if word.endswith(".toml") else DEFINITIONS / f"{word}.toml" for word in study]
-    files = [path for word, path in zip(study, named, strict=True) if word.endswith(".toml") or path.exists()]
+    named = [
+        Path(word) if word.endswith(".toml") else DEFINITIONS / f"{word}.toml" for word in study
+    ]
+    files = [
+        path
+        for word, path in zip(study, named, strict=True)
+        if word.endswith(".toml") or path.exists()
+    ]
     scenes = [Path(word) for word, path in zip(study, named, strict=True) if path not in files]
     if not files:
         there = ", ".join(sorted(path.stem for path in DEFINITIONS.glob("*.toml")))
         raise typer.BadParameter(f"no study {study[0]!r} (there are {there})")
     if not scenes and (views or held_out or photos):
-        raise typer.BadParameter("--views, --held-out and --photos go with scenes: a study names its own")
+        raise typer.BadParameter(
+            "--views, --held-out and --photos go with scenes: a study names its own"
+        )
     specs = tuple(
         SceneSpec(
             scene_label(scene),
@@ -114,7 +126,11 @@ def run_(
             run.say(f"{path}: has no {name}, and --{name.replace('_', '-')} is ignored there")
         unfit |= set() if hasattr(one, "lpips") else {"lpips"}
         one = one.narrowed({name: given[name] for name in given if name not in unfit} | forced)
-        wanted = one.scenes if only is None else tuple(s for s in one.scenes if s.name in only.split(","))
+        wanted = (
+            one.scenes
+            if only is None
+            else tuple(s for s in one.scenes if s.name in only.split(","))
+        )
         if not wanted:
             there = f"no scene {only!r} (it has {', '.join(s.name for s in one.scenes)})"
             raise InputError(f"{path}: {there if one.scenes else 'no scenes: give some'}")

@@ -23,7 +23,9 @@ def main(source: str, target: str, along: int, across: int) -> None:
     rows = np.memmap(source, np.float32, "r", len(header), (count, width))
     low, high = np.percentile(rows[::100, :3], (0.5, 99.5), axis=0)
     second, first = np.argsort(low - high)[:2]
-    moved = header.replace(b"element vertex %d" % count, b"element vertex %d" % (count * along * across))
+    moved = header.replace(
+        b"element vertex %d" % count, b"element vertex %d" % (count * along * across)
+    )
     with Path(target).open("wb") as file:
         file.write(moved)
         for i in range(along):

@@ -41,12 +41,16 @@ def standalone(svg: str, series: Iterable[str]) -> str:
     start, rest = body.split(">", 1)
     rest = rest.removesuffix("</svg>")
     background = f'<rect width="560" height="{height}" fill="#fff"/>'
-    return f"{head}{start}><style>{STYLE}{colors}</style>{background}{rest}{''.join(legend)}</svg>\n"
+    return (
+        f"{head}{start}><style>{STYLE}{colors}</style>{background}{rest}{''.join(legend)}</svg>\n"
+    )
 
 
 def lead(kind: str) -> str:
     """Plot the gain of `default` over the better peer by ratio, dB, in one kind of views."""
-    recorded = [r for r in rows("intel-xeon-2c/simplify-standing-2026-11-22.csv") if r["views_kind"] == kind]
+    recorded = [
+        r for r in rows("intel-xeon-2c/simplify-standing-2026-11-22.csv") if r["views_kind"] == kind
+    ]
     psnr = {(r["scene"], float(r["ratio"]), r["method"]): float(r["psnr"]) for r in recorded}
     scenes = sorted({scene for scene, _, _ in psnr})
     points = []
@@ -55,7 +59,9 @@ def lead(kind: str) -> str:
         if method == "default" and peers:
             points.append(Point(ratio, value - max(peers), scenes.index(scene), text=scene))
     label = f"dB over the better peer, {kind} views"
-    return standalone(draw_chart(points, x_label="ratio", y_label=label, log=True, joined=True), scenes)
+    return standalone(
+        draw_chart(points, x_label="ratio", y_label=label, log=True, joined=True), scenes
+    )
 
 
 def curve(scene: str, variants: tuple[str, ...]) -> str:
@@ -69,21 +75,34 @@ def curve(scene: str, variants: tuple[str, ...]) -> str:
         and r["count"] == r["budget"]  # rounds pass through larger counts first
     ]
     points = [
-        Point(float(r["seconds"]), float(r["psnr"]), variants.index(r["variant"]), text=f"{r['step']} steps")
+        Point(
+            float(r["seconds"]),
+            float(r["psnr"]),
+            variants.index(r["variant"]),
+            text=f"{r['step']} steps",
+        )
         for r in recorded
     ]
-    drawn = draw_chart(points, x_label="seconds of recovery", y_label="PSNR, dB", log=True, joined=True)
+    drawn = draw_chart(
+        points, x_label="seconds of recovery", y_label="PSNR, dB", log=True, joined=True
+    )
     return standalone(drawn, variants)
 
 
 def frontier() -> str:
     """Plot PSNR in unseen views of the usual kind against the CPU time of whole commands, for two scenes."""
-    names = [f"{scene}: {whose}" for scene in ("playbot", "guitar") for whose in ("g2ard", "splat-transform")]
+    names = [
+        f"{scene}: {whose}"
+        for scene in ("playbot", "guitar")
+        for whose in ("g2ard", "splat-transform")
+    ]
     points = []
     for row in rows("amd-epyc-2c/frontier-2026-11-28.csv"):
         whose = "splat-transform" if row["method"] == "splat-transform" else "g2ard"
         if row["views_kind"] == "pool" and (name := f"{row['scene']}: {whose}") in names:
-            at = Point(float(row["cpu_s"]), float(row["psnr"]), names.index(name), text=row["method"])
+            at = Point(
+                float(row["cpu_s"]), float(row["psnr"]), names.index(name), text=row["method"]
+            )
             points.append(at)
     drawn = draw_chart(points, x_label="CPU seconds", y_label="PSNR, dB", log=True, joined=True)
     return standalone(drawn, names)
@@ -97,8 +116,12 @@ def sizes() -> str:
     for row in rows("amd-epyc-2c/sizes-2026-11-28.csv"):
         if row["views_kind"] == "pool" and row["method"] in methods:
             name = f"{row['scene']}: {methods[row['method']]}"
-            points.append(Point(float(row["scale"]), float(row["psnr"]), names.index(name), text=name))
-    drawn = draw_chart(points, x_label="size of views / 800 px", y_label="PSNR, dB", log=True, joined=True)
+            points.append(
+                Point(float(row["scale"]), float(row["psnr"]), names.index(name), text=name)
+            )
+    drawn = draw_chart(
+        points, x_label="size of views / 800 px", y_label="PSNR, dB", log=True, joined=True
+    )
     return standalone(drawn, names)
 
 
@@ -109,8 +132,12 @@ def plots() -> dict[str, str]:
         "sizes.svg": sizes(),
         "simplify-pool.svg": lead("pool"),
         "simplify-standing.svg": lead("standing"),
-        "recover-guitar.svg": curve("guitar 400px", ("default@300", "default@1000", "default@2000")),
-        "recover-playbot.svg": curve("playbot/0_0 800px", ("default@300", "default@1000", "default@3000")),
+        "recover-guitar.svg": curve(
+            "guitar 400px", ("default@300", "default@1000", "default@2000")
+        ),
+        "recover-playbot.svg": curve(
+            "playbot/0_0 800px", ("default@300", "default@1000", "default@3000")
+        ),
     }
 
 

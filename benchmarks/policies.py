@@ -17,7 +17,12 @@ POLICIES = ("random", "pose-diverse", "coverage", *choices.POLICIES)
 
 
 def order_views(
-    splats: Splats, cameras: Cameras, policy: str, *, seed: int = 0, options: CoverageOptions | None = None
+    splats: Splats,
+    cameras: Cameras,
+    policy: str,
+    *,
+    seed: int = 0,
+    options: CoverageOptions | None = None,
 ) -> Int:
     """Return the views that a policy may choose, best first.
 

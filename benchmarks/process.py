@@ -104,7 +104,11 @@ def splat_transform(*arguments: str) -> list[str]:
 def version_of(*program: str) -> str:
     """Return the first line that a program prints for --version."""
     told = subprocess.run(
-        [*program, "--version"], capture_output=True, encoding="utf-8", errors="replace", check=False
+        [*program, "--version"],
+        capture_output=True,
+        encoding="utf-8",
+        errors="replace",
+        check=False,
     )
     lines = (told.stdout or told.stderr).splitlines()
     return lines[0].strip() if lines else ""
@@ -121,5 +125,7 @@ def cpu_name() -> str:
         text = Path("/proc/cpuinfo").read_text(encoding="utf-8")
     except OSError:
         return platform.processor() or platform.machine()
-    names = (line.split(":", 1)[1].strip() for line in text.splitlines() if line.startswith("model name"))
+    names = (
+        line.split(":", 1)[1].strip() for line in text.splitlines() if line.startswith("model name")
+    )
     return next(names, platform.machine())

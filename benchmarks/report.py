@@ -56,7 +56,9 @@ def _study(page: Page, folder: Path, study: Study, rows: list[Row]) -> None:
         page.html(f"<ul>{''.join(f'<li>{escape(line)}</li>' for line in study.differs)}</ul>")
     names = list(dict.fromkeys(map(_name, rows)))
     matched = {row.get("matched") for row in rows}
-    page.html(draw_legend(names, [f"{mark} {kind}" for kind, mark in _MARKS.items() if kind in matched]))
+    page.html(
+        draw_legend(names, [f"{mark} {kind}" for kind, mark in _MARKS.items() if kind in matched])
+    )
     for line in dict.fromkeys(line for row in rows for line in _notes(row)):
         page.paragraph(line)
     summary = study.summary(rows)
@@ -65,7 +67,11 @@ def _study(page: Page, folder: Path, study: Study, rows: list[Row]) -> None:
         page.table(summary[1], summary[2])
 
     def place(row: Row) -> tuple[str, str, str]:
-        return row["scene"], row.get("split", "") or row.get("views_kind", ""), row.get("against", "")
+        return (
+            row["scene"],
+            row.get("split", "") or row.get("views_kind", ""),
+            row.get("against", ""),
+        )
 
     whole = [row for row in rows if "error" not in row]
     for (scene, split, against), members in groupby(sorted(whole, key=place), place):
@@ -84,7 +90,9 @@ def _study(page: Page, folder: Path, study: Study, rows: list[Row]) -> None:
 def _place_side_by_side(charts: Sequence[tuple[str, str]]) -> str:
     """Return HTML of (caption, svg) charts side by side."""
     figures = (
-        f"<figure>{svg}<figcaption>{escape(caption)}</figcaption></figure>" for caption, svg in charts if svg
+        f"<figure>{svg}<figcaption>{escape(caption)}</figcaption></figure>"
+        for caption, svg in charts
+        if svg
     )
     return f'<div class="row">{"".join(figures)}</div>'
 
@@ -109,9 +117,7 @@ def _notes(row: Row) -> list[str]:
         dropped = f"{row['dropped']} views to train on are scored on: they were not trained on."
         lines.append(f"{row['scene']}: {dropped}")
     if row.get("black"):
-        count = (
-            f"{row['black']} of {row['black'] + row['views']} {row.get('split', '')} renders are all black"
-        )
+        count = f"{row['black']} of {row['black'] + row['views']} {row.get('split', '')} renders are all black"
         lines.append(f"{_label(row)}: {count}, and not in its means.")
     return lines
 
@@ -120,13 +126,22 @@ def _charts(rows: Sequence[Row], names: Sequence[str]) -> list[tuple[str, str]]:
     charts = []
     rows = [row for row in rows if row.get("matched") != "none"]
     for ratio in sorted({row.get("ratio", 0.0) for row in rows}):
-        points = [_point(row, row.get("cpu_s", 0.0), names) for row in rows if row.get("ratio", 0.0) == ratio]
+        points = [
+            _point(row, row.get("cpu_s", 0.0), names)
+            for row in rows
+            if row.get("ratio", 0.0) == ratio
+        ]
         best = {id(point) for point in find_front(points)}
-        points = [Point(p.x, p.y, p.series, p.mark, p.text, p.label if id(p) in best else "") for p in points]
+        points = [
+            Point(p.x, p.y, p.series, p.mark, p.text, p.label if id(p) in best else "")
+            for p in points
+        ]
         svg = draw_chart(points, x_label="CPU seconds", y_label="PSNR, dB", log=True, front=True)
         charts.append((f"{ratio:g}×: error against time; dashed: the Pareto front", svg))
     if len({row.get("ratio") for row in rows}) > 1:
-        for matched in dict.fromkeys((row.get("matched", ""), row.get("amount", 0.0)) for row in rows):
+        for matched in dict.fromkeys(
+            (row.get("matched", ""), row.get("amount", 0.0)) for row in rows
+        ):
             points = [
                 _point(row, row["count"], names)
                 for row in rows
@@ -150,7 +165,9 @@ def _best(rows: Sequence[Row], columns: Sequence[str]) -> set[tuple[int, int]]:
     groups: dict[tuple[Any, ...], list[int]] = {}
     for number, row in enumerate(rows):
         if row.get("matched") != "none":
-            groups.setdefault(tuple(row.get(n) for n in ("ratio", "matched", "amount")), []).append(number)
+            groups.setdefault(tuple(row.get(n) for n in ("ratio", "matched", "amount")), []).append(
+                number
+            )
     return {
         (max(numbers, key=lambda n: rows[n].get(name, -np.inf)), columns.index(name))
         for numbers in groups.values()

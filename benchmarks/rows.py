@@ -202,10 +202,17 @@ def shown(rows: Iterable[Row], width: int | None = None) -> tuple[list[str], lis
             column. If it is still too wide, columns of `_MINOR` are dropped as well.
     """
     rows = list(rows)
-    names = [n for n, column in COLUMNS.items() if column.form is not None and any(n in row for row in rows)]
+    names = [
+        n
+        for n, column in COLUMNS.items()
+        if column.form is not None and any(n in row for row in rows)
+    ]
     if width is not None and len(rows) > 1:
         names = [n for i, n in enumerate(names) if i == 0 or len({row.get(n) for row in rows}) > 1]
-    cells = {n: [format(row[n], COLUMNS[n].form or "") if n in row else "" for row in rows] for n in names}
+    cells = {
+        n: [format(row[n], COLUMNS[n].form or "") if n in row else "" for row in rows]
+        for n in names
+    }
     for minor in _MINOR:
         needed = sum(3 + max(map(len, [n, *column])) for n, column in cells.items()) + 1
         if width is not None and needed > width:

@@ -77,7 +77,9 @@ def run(
                 text = " ".join(str(error).split()) or type(error).__name__
                 found = [rounded({**about, **named, "error": text})]
             own = rounded(named).items()
-            held = [row for row in held if row.get("cell") != key and not own <= row.items()] + found
+            held = [
+                row for row in held if row.get("cell") != key and not own <= row.items()
+            ] + found
             write_rows(path, _derived(studies, held))
     progress("bench", total, total, {})
     held = _derived(studies, held)
@@ -115,8 +117,17 @@ def fingerprint(value: Any) -> str:
 
 def scene_key(study: Study, scene: SceneSpec) -> str:
     """Return a hash that changes with the scene, its files and its views."""
-    stated = {**asdict(scene), "size": study.size, "pool_seed": study.pool_seed, "version": __version__}
-    files = () if scene.synth is not None else (scene.prior, scene.train, scene.adapt, *scene.score.values())
+    stated = {
+        **asdict(scene),
+        "size": study.size,
+        "pool_seed": study.pool_seed,
+        "version": __version__,
+    }
+    files = (
+        ()
+        if scene.synth is not None
+        else (scene.prior, scene.train, scene.adapt, *scene.score.values())
+    )
     stamps = [_stamp(study.folder / file) for file in files if file is not None]
     return fingerprint({**stated, "files": stamps})
 

@@ -18,10 +18,29 @@ from g2ard.errors import InputError, require_torch
 if TYPE_CHECKING:
     from benchmarks.rows import Row
 
-__all__ = ["DEFINITIONS", "Cell", "SceneSpec", "Study", "checked", "key", "read_study", "scene_label"]
+__all__ = [
+    "DEFINITIONS",
+    "Cell",
+    "SceneSpec",
+    "Study",
+    "checked",
+    "key",
+    "read_study",
+    "scene_label",
+]
 
 DEFINITIONS = Path(__file__).parent / "definitions"
-KINDS = ("matched", "simplify", "recover", "select", "ship", "register", "raster", "boxes", "devices")
+KINDS = (
+    "matched",
+    "simplify",
+    "recover",
+    "select",
+    "ship",
+    "register",
+    "raster",
+    "boxes",
+    "devices",
+)
 """Modules of `benchmarks.kinds`; each holds the subclass of `Study` of the same name, capitalised."""
 
 _VARIABLE = re.compile(r"\$\{?(\w+)")
@@ -34,7 +53,11 @@ _TYPES: dict[str, tuple[Any, str]] = {
 
 
 def key(
-    default: Any = MISSING, *, least: float = -math.inf, choices: Sequence[Any] = (), axis: bool = False
+    default: Any = MISSING,
+    *,
+    least: float = -math.inf,
+    choices: Sequence[Any] = (),
+    axis: bool = False,
 ) -> Any:
     """Declare a key of a TOML table.
 
@@ -191,9 +214,19 @@ class Study(ABC):
 
     def narrowed(self, options: Mapping[str, Any]) -> Self:
         """Return the study with changed keys; `scene.KEY` sets a key of all scenes."""
-        own = {name: _spread(type(self), name, value) for name, value in options.items() if "." not in name}
-        scene = {n[6:]: _spread(SceneSpec, n[6:], v) for n, v in options.items() if n.startswith("scene.")}
-        unknown = next((name for name in options if "." in name and not name.startswith("scene.")), None)
+        own = {
+            name: _spread(type(self), name, value)
+            for name, value in options.items()
+            if "." not in name
+        }
+        scene = {
+            n[6:]: _spread(SceneSpec, n[6:], v)
+            for n, v in options.items()
+            if n.startswith("scene.")
+        }
+        unknown = next(
+            (name for name in options if "." in name and not name.startswith("scene.")), None
+        )
         if unknown is not None:
             raise InputError(f"no key {unknown!r}")
         methods = own.pop("methods", None)
@@ -231,15 +264,21 @@ def read_study(path: Path) -> Study:
             known[name] = _method(cls, name, values, known)
         methods = _chosen(known, content.pop("methods", list(tables) or cls.default_methods()))
         scenes = tuple(_scene(values) for values in content.pop("scene", []))
-        twice = next((s.name for i, s in enumerate(scenes) if s.name in {o.name for o in scenes[:i]}), None)
+        twice = next(
+            (s.name for i, s in enumerate(scenes) if s.name in {o.name for o in scenes[:i]}), None
+        )
         if twice is not None:
             raise InputError(f"scene {twice}: the name is used twice")
         if "keep" in content:
             content["ratios"] = _ratios_of(content.pop("keep"), "ratios" in content)
-        values = checked(cls, {"title": path.stem, **content}, {"name", "scenes", "methods", "folder"})
+        values = checked(
+            cls, {"title": path.stem, **content}, {"name", "scenes", "methods", "folder"}
+        )
         folder = path.parent.absolute()
         made = cls(name=path.stem, scenes=scenes, methods=methods, folder=folder, **values)
-        lacks = next((name for name in ("methods", "ratios", "seeds") if not getattr(made, name)), None)
+        lacks = next(
+            (name for name in ("methods", "ratios", "seeds") if not getattr(made, name)), None
+        )
         if lacks is not None:
             raise InputError(f"no {lacks}: there is nothing to measure")
         return made
@@ -253,7 +292,9 @@ def scene_label(path: Path) -> str:
     >>> scene_label(Path("data/guitar.compressed.ply"))
     'guitar'
     """
-    return f"{path.absolute().parent.name}/{path.name}" if path.is_dir() else path.name.split(".")[0]
+    return (
+        f"{path.absolute().parent.name}/{path.name}" if path.is_dir() else path.name.split(".")[0]
+    )
 
 
 def checked(kind: type, values: Mapping[str, Any], withheld: set[str]) -> dict[str, Any]:
@@ -270,7 +311,9 @@ def _value(key_: Field[Any], given: Any) -> Any:
     if kind.startswith("Mapping["):
         if not isinstance(given, dict):
             raise InputError(f"{key_.name}: expected a table, got {given!r}")
-        return {name: os.path.expandvars(v) if isinstance(v, str) else v for name, v in given.items()}
+        return {
+            name: os.path.expandvars(v) if isinstance(v, str) else v for name, v in given.items()
+        }
     if not kind.startswith("tuple["):
         return _item(key_, kind, given)
     if not isinstance(given, list | tuple):
@@ -292,7 +335,9 @@ def _item(key_: Field[Any], kind: str, given: Any) -> Any:
         fits = (least is None or least <= given) and given < math.inf
     if not fits or (choices and given not in choices):
         raise InputError(f"{key_.name}: expected {words}, got {given!r}")
-    return os.path.expandvars(given) if kind == "str" else float(given) if kind == "float" else given
+    return (
+        os.path.expandvars(given) if kind == "str" else float(given) if kind == "float" else given
+    )
 
 
 def _method(cls: type[Study], name: str, values: dict[str, Any], known: Mapping[str, Any]) -> Any:

@@ -56,7 +56,13 @@ _PATIENCE = 40
 
 
 def hidden_targets(
-    splats: Splats, scene: Path, kinds: tuple[str, ...], *, seed: int, size: int | None, background: Colour
+    splats: Splats,
+    scene: Path,
+    kinds: tuple[str, ...],
+    *,
+    seed: int,
+    size: int | None,
+    background: Colour,
 ) -> dict[str, TeacherRenders]:
     """Return renders of the kinds "near", "standing" and "anywhere" that are requested and have room.
 
@@ -108,7 +114,9 @@ def given_views(scene: Path) -> Cameras | None:
         InputError: the file is invalid.
     """
     folder = scene.absolute() if scene.is_dir() else scene.absolute().parent
-    path = next((p for place in (folder, folder.parent) if (p := place / "standing.json").is_file()), None)
+    path = next(
+        (p for place in (folder, folder.parent) if (p := place / "standing.json").is_file()), None
+    )
     if path is None:
         return None
     found = io.read_view_set(path)
@@ -168,7 +176,10 @@ def anywhere_views(splats: Splats, count: int = _ANYWHERE, seed: int = 0) -> Cam
         row = int(rows[chance.integers(len(rows))])
         distance = diagonal * np.exp(chance.uniform(*np.log(_DISTANCES)))
         rise, turn = np.radians(chance.uniform(*_RISES)), chance.uniform(0, 2 * np.pi)
-        outward = np.array([np.cos(rise) * np.cos(turn), np.cos(rise) * np.sin(turn), np.sin(rise)]) @ frame
+        outward = (
+            np.array([np.cos(rise) * np.cos(turn), np.cos(rise) * np.sin(turn), np.sin(rise)])
+            @ frame
+        )
         eye = means[row] + distance * outward
         view = look_at(eye, means[row], up)
         away = np.linalg.norm(means - eye, axis=1)

@@ -116,7 +116,9 @@ class Workspace:
         if self.lifted:
             points = io.read_points(source)
             every = evenly_spaced(len(points.positions), self.scene.points or len(points.positions))
-            return lift(points.positions[every], None if points.colors is None else points.colors[every])
+            return lift(
+                points.positions[every], None if points.colors is None else points.colors[every]
+            )
         splats = io.read_splats(source)
         logits = np.clip(splats.logit_opacities, -_MAX_LOGIT, _MAX_LOGIT)
         return replace(splats, logit_opacities=logits)
@@ -157,7 +159,9 @@ class Workspace:
             if what == "adapt" or name != "adapt-val":  # new appearance may show trained places
                 keep &= not_held_out(cameras, scored)
         if not keep.any():
-            raise InputError(f"all {plural(len(keep), 'view')} to {what} on are scored; none remain")
+            raise InputError(
+                f"all {plural(len(keep), 'view')} to {what} on are scored; none remain"
+            )
         io.write_views(path, cameras.take(keep), splits=["train"] * int(np.count_nonzero(keep)))
 
     @property
@@ -206,11 +210,16 @@ class Workspace:
     def missing(self) -> dict[str, Path]:
         """The optional views to score on whose files do not exist, by name."""
         paths = {name: self.place / path for name, path in self.scene.score.items()}
-        return {name: p for name, p in paths.items() if name in self.scene.optional and not p.exists()}
+        return {
+            name: p for name, p in paths.items() if name in self.scene.optional and not p.exists()
+        }
 
     def notes(self) -> list[str]:
         """Return missing optional files, and counts that differ from those the scene expects."""
-        notes = [f"{name}: {path} does not exist, so no row has it" for name, path in self.missing.items()]
+        notes = [
+            f"{name}: {path} does not exist, so no row has it"
+            for name, path in self.missing.items()
+        ]
         found = {name: len(cameras) for name, cameras in self.scored.items()}
         if "prior" in self.scene.expects:
             found["prior"] = len(self.splats)
@@ -221,12 +230,16 @@ class Workspace:
                 notes.append(f"{name}: {plural(found[name], unit)}, the paper has {wanted:,}")
         return notes
 
-    def targets(self, cameras: Cameras, settings: RasterSettings | None = None, **options: Any) -> Targets:
+    def targets(
+        self, cameras: Cameras, settings: RasterSettings | None = None, **options: Any
+    ) -> Targets:
         """Return the targets of views: photos, or renders of the prior."""
         if self.scene.targets == "photos":
             return Photos(cameras, background=self.scene.background, **options)
         if self.lifted:
-            raise InputError(f"scene {self.scene.name}: a point cloud has no renders; set targets = 'photos'")
+            raise InputError(
+                f"scene {self.scene.name}: a point cloud has no renders; set targets = 'photos'"
+            )
         kind = TeacherRenders if self.scene.targets == "teacher" else PhotosOrRenders
         look = {"background": self.scene.background, "settings": settings, **options}
         return kind(teacher=self.splats, cameras=cameras, **look)
@@ -248,8 +261,15 @@ class Workspace:
         """
         found = {"pool": self.targets(next(iter(self.scored.values())))}
         wanted = kinds_for(getattr(self.study, "protocol", "all"), self.scene)
-        found |= {name: self.targets(cameras) for name, cameras in self.scored.items() if name in wanted}
+        found |= {
+            name: self.targets(cameras) for name, cameras in self.scored.items() if name in wanted
+        }
         source, study, background = self.place / self.scene.prior, self.study, self.scene.background
         return found | hidden_targets(
-            self.splats, source, wanted, seed=study.pool_seed, size=study.size, background=background
+            self.splats,
+            source,
+            wanted,
+            seed=study.pool_seed,
+            size=study.size,
+            background=background,
         )

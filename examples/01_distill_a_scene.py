@@ -25,7 +25,15 @@ def main() -> None:
     playbot = Path(os.environ.get("G2ARD_DATA", "")) / "playbot" / "0_0"
     if os.environ.get("G2ARD_DATA") and playbot.is_dir():
         # Trained, without photos: a pool of poses is made, and the scene itself is the teacher.
-        g2ard("distill", str(playbot), "--ratio", "10", "--output", str(OUT / "playbot"), "--overwrite")
+        g2ard(
+            "distill",
+            str(playbot),
+            "--ratio",
+            "10",
+            "--output",
+            str(OUT / "playbot"),
+            "--overwrite",
+        )
     else:
         # A LiDAR-like cloud has geometry but no appearance: its photos are the targets.
         city = OUT / "city"
@@ -43,7 +51,9 @@ def main() -> None:
         subprocess.run([sys.executable, *make], check=True)
         views = ["--views", str(city / "train.json"), "--held-out", str(city / "val.json")]
         options = ["--ratio", "10", "--background", "0.6,0.8,1", "--overwrite"]  # the sky's colour
-        g2ard("distill", str(city / "cloud.ply"), *views, *options, "--output", str(OUT / "city-10x"))
+        g2ard(
+            "distill", str(city / "cloud.ply"), *views, *options, "--output", str(OUT / "city-10x")
+        )
 
 
 if __name__ == "__main__":

@@ -202,7 +202,9 @@ _ALIASES = {
 
 
 def __getattr__(name: str) -> Any:
-    home, own = _ALIASES.get(name, (next((m for m, names in _HOMES.items() if name in names), None), name))
+    home, own = _ALIASES.get(
+        name, (next((m for m, names in _HOMES.items() if name in names), None), name)
+    )
     if home is None:
         raise AttributeError(f"module 'g2ard' has no attribute {name!r}")
     if name == "rasterize":

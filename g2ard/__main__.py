@@ -10,7 +10,8 @@ def main() -> None:
     """Entry point."""
     interrupt.ends_the_program()
     if not sys.warnoptions:
-        warnings.simplefilter("ignore")  # an error is one line; of what is no error we tell in our own words
+        # an error is one line; of what is no error we tell in our own words
+        warnings.simplefilter("ignore")
     try:
         from g2ard.cli.main import main as command_line
 

@@ -9,7 +9,9 @@ from typing import Any, Protocol
 class Progress(Protocol):
     """Callback with the stage's name, units done, total units (0 if unknown) and figures to show."""
 
-    def __call__(self, stage: str, done: int, total: int, info: Mapping[str, Any] = ...) -> None: ...
+    def __call__(
+        self, stage: str, done: int, total: int, info: Mapping[str, Any] = ...
+    ) -> None: ...
 
 
 def silent(stage: str, done: int, total: int, info: Mapping[str, Any] | None = None) -> None:
@@ -29,7 +31,8 @@ class _Line:
         self.stage = ""
         self.began = 0.0
         self.drawn = 0.0
-        self.cell: tuple[int, Any] | None = None  # of a notebook: number, and handle of the line in it
+        # of a notebook: number, and handle of the line in it
+        self.cell: tuple[int, Any] | None = None
 
     def show(self, text: str, shell: Any) -> None:
         """Redraw the line: by its handle in the cell of a notebook, otherwise on stderr."""
@@ -80,7 +83,11 @@ def show_progress(stage: str, done: int, total: int, info: Mapping[str, Any] | N
         if shell is not None and total:
             filled = _BAR * done // total
             spent = now - _line.began
-            left = f"{spent * (total - done) / done:.0f} s left" if 0 < done < total else f"{spent:.1f} s"
+            left = (
+                f"{spent * (total - done) / done:.0f} s left"
+                if 0 < done < total
+                else f"{spent:.1f} s"
+            )
             text = f"{text} {'█' * filled}{'░' * (_BAR - filled)} {left}"
         _line.show(text, shell)
 

@@ -30,7 +30,8 @@ from helpers.scenes import around, checkered_ball
 Said = tuple[int, str, str]
 
 
-signal.signal(signal.SIGINT, signal.default_int_handler)  # processes in the background start with it ignored
+# processes in the background start with it ignored
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture(autouse=True)
@@ -74,7 +75,8 @@ def pytest_terminal_summary(terminalreporter: Any) -> None:
     """Count the skipped tests by reason. `.ci/run` repeats these lines at its end."""
     stats = terminalreporter.stats
     tests = sum(
-        len(stats.get(kind, [])) for kind in ("passed", "failed", "skipped", "error", "xfailed", "xpassed")
+        len(stats.get(kind, []))
+        for kind in ("passed", "failed", "skipped", "error", "xfailed", "xpassed")
     )
     reasons = Counter(_reason(report) for report in stats.get("skipped", []))
     terminalreporter.line("")
@@ -152,7 +154,8 @@ def _here(words: list[str], cwd: Path, env: dict[str, str]) -> Said:
         patch("g2ard.system.interrupt.ends_the_program"),  # signals stay those of pytest
         patch("gc.freeze"),  # `main` takes it that the program ends
         patch("typer.main.get_command", lambda app: _parser(app, len(app.registered_commands))),
-        patch("webbrowser.open", side_effect=KeyboardInterrupt),  # a page that is shown is closed at once
+        # a page that is shown is closed at once
+        patch("webbrowser.open", side_effect=KeyboardInterrupt),
     ):
         os.chdir(cwd)
         try:
@@ -161,7 +164,8 @@ def _here(words: list[str], cwd: Path, env: dict[str, str]) -> Said:
             status = end.code
         finally:
             os.chdir(before)
-            for name in set(sys.modules) - known:  # a user's module of that name may be another's next time
+            # a user's module of that name may be another's next time
+            for name in set(sys.modules) - known:
                 if Path(str(getattr(sys.modules[name], "__file__", None))).parent == cwd:
                     del sys.modules[name]
     return int(status or 0) if isinstance(status, int | None) else 1, out.getvalue(), err.getvalue()
@@ -169,7 +173,14 @@ def _here(words: list[str], cwd: Path, env: dict[str, str]) -> Said:
 
 _USUAL_VIEWS = {"test_floors", "test_generated_views", "test_notes", "test_stopped_runs"}
 """Modules whose generated views have the usual size, as their numbers and kinds depend on it."""
-_UNSCORED = {"cli", "levels", "report", "viewer", "tests/test_documented_commands", "tiles/test_distill"}
+_UNSCORED = {
+    "cli",
+    "levels",
+    "report",
+    "viewer",
+    "tests/test_documented_commands",
+    "tiles/test_distill",
+}
 """Folders and modules whose tests ask for no score, or compare scores in equal views: any views will do."""
 
 

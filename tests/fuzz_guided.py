@@ -102,7 +102,9 @@ def main() -> None:
         if options.only not in what:
             continue
         words = ["--case", what, "--seconds", str(options.seconds), "--seed", str(options.seed)]
-        run = subprocess.run([sys.executable, __file__, *words], capture_output=True, text=True, check=False)
+        run = subprocess.run(
+            [sys.executable, __file__, *words], capture_output=True, text=True, check=False
+        )
         count = int(found[1]) if (found := _DONE.search(run.stderr)) else 0
         print(f"{what:28} {count:12,}  {'found something' if run.returncode else ''}", flush=True)
         if run.returncode:

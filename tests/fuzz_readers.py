@@ -51,7 +51,16 @@ EXTREMES = [
     for value in values
 ]
 WORDS = [
-    *(b"0", b"-1", b"1e308", b"1e999", b"NaN", b"-Infinity", b"4000000000", b"99999999999999999999"),
+    *(
+        b"0",
+        b"-1",
+        b"1e308",
+        b"1e999",
+        b"NaN",
+        b"-Infinity",
+        b"4000000000",
+        b"99999999999999999999",
+    ),
     *(b"null", b"true", b"[]", b"{}", b'""', b'"x"', b"[[]]", b'"\\u0000"', b"1" + b"0" * 400),
 ]
 NUMBER = re.compile(rb"-?\d+(\.\d+)?([eE][-+]?\d+)?|\"[^\"]*\"|\bnull\b")
@@ -96,7 +105,9 @@ def repacked(content: bytes, rng: np.random.Generator) -> bytes:
         chosen = "meta.json" if rng.random() < 0.5 else sorted(files)[rng.integers(len(files))]
         files[chosen] = mutated(files[chosen], rng)
         buffer = io.BytesIO()
-        with zipfile.ZipFile(buffer, "w", (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)[rng.integers(2)]) as out:
+        with zipfile.ZipFile(
+            buffer, "w", (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)[rng.integers(2)]
+        ) as out:
             for name, part in files.items():
                 out.writestr(name, part)
         return buffer.getvalue()
@@ -136,7 +147,10 @@ def answer(path: Path, folder: Path) -> tuple[str, str]:
         line = read_checked(path)
     except Exception as error:
         at = traceback.extract_tb(error.__traceback__)[-1]
-        return f"{type(error).__name__} in {Path(at.filename).name}:{at.lineno}: {str(error)[:120]}", ""
+        return (
+            f"{type(error).__name__} in {Path(at.filename).name}:{at.lineno}: {str(error)[:120]}",
+            "",
+        )
     if line is None:
         return "read", ""
     one_line = "\n" not in line and str(folder) in line
@@ -147,7 +161,9 @@ NAMED = ["transforms", "cameras.json", "views", "ns-export", "meta.json", "lod-m
 """Files of JSON: if a property becomes the word x, the error names the property, its holder or x."""
 
 
-def break_rules(what: str, make: Callable[[Path], Path], folder: Path, every: int = 1) -> Counter[str]:
+def break_rules(
+    what: str, make: Callable[[Path], Path], folder: Path, every: int = 1
+) -> Counter[str]:
     """Read every n-th malformed version of one case: how many were read or refused, and what else came."""
     path = make(folder)
     content = path.read_bytes()
@@ -217,13 +233,17 @@ def main() -> None:
     for what, make in MAKERS.items():
         if options.only not in what:
             continue
-        folder = Path(tempfile.mkdtemp(prefix="g2ard-fuzz-", dir=memory if memory.is_dir() else None))
+        folder = Path(
+            tempfile.mkdtemp(prefix="g2ard-fuzz-", dir=memory if memory.is_dir() else None)
+        )
         start = time.process_time()
         tally = break_rules(what, make, folder)
         tally += fuzz(what, make, folder, runs, options.seed, options.seconds or float("inf"))
         rate = tally.total() / (time.process_time() - start)
         read, refused = tally.pop("read", 0), tally.pop("refused", 0)
-        print(f"{what:28} read {read:9,}  refused {refused:9,}  {rate:6,.0f} a CPU second", flush=True)
+        print(
+            f"{what:28} read {read:9,}  refused {refused:9,}  {rate:6,.0f} a CPU second", flush=True
+        )
         if not tally:
             shutil.rmtree(folder)
         for found, times in tally.items():

@@ -68,7 +68,8 @@ Found = dict[str, Any]
 
 _TIME = r"\d[\d.,]* ?(?:ms|s|min|h)\b(?: \d+ (?:s|min)\b)?"
 _MASKS = (
-    (re.compile(rf"(?m)^[^:\n]+:(?: [\d,/]+)?  {_TIME}(?:  .*)?\n"), ""),  # progress of a long stage
+    # progress of a long stage
+    (re.compile(rf"(?m)^[^:\n]+:(?: [\d,/]+)?  {_TIME}(?:  .*)?\n"), ""),
     (re.compile(r"\b\d{4}-\d\d-\d\d([T ]\d\d:\d\d(:\d\d)?)?|\b\d\d?:\d\d(:\d\d)?\b"), "<date>"),
     (re.compile(rf"\b{_TIME}"), "<time>"),
     (re.compile(r"\b\d[\d.,]* (?:k|M|G)B\b"), "<size>"),
@@ -181,7 +182,9 @@ def found(place: Place, done: list[tuple[int, str, str]]) -> Found:
     files = place.files()
     errors = [error.strip()[:200] for status, _, error in done if status]
     json_keys = [key for i, row in enumerate(done) for key in keys(row[1], str(i))]
-    json_keys += [key for name, data in files.items() if name.endswith(".json") for key in keys(data, name)]
+    json_keys += [
+        key for name, data in files.items() if name.endswith(".json") for key in keys(data, name)
+    ]
     return {
         "status": [row[0] for row in done],
         **({"errors": errors} if errors else {}),
@@ -210,7 +213,9 @@ def run_commands(place: Place, commands: list[list[str]], interrupted: bool) -> 
         place.clear()
         place.does(f"killed{after}", killed(command(first), after))
         again = [place.does(f"again{after}", command(resumed(first)))]
-        again += [place.does(f"again{after}.{i}", command(words)) for i, words in enumerate(others, 1)]
+        again += [
+            place.does(f"again{after}.{i}", command(words)) for i, words in enumerate(others, 1)
+        ]
         ended = found(place, again)
         lost = differing(result["files"], ended["files"])
         right = ended["status"] == result["status"] and not lost
@@ -287,7 +292,9 @@ def run_stopped(place: Place, call: Callable[[Any, Path, Any], Any]) -> Found:
         place.does(f"stopped{stop}", attempt(stop))
         again = found(place, [place.does(f"again{stop}", attempt(0))])
         right = (again["status"], again["out"]) == ([0], whole)
-        result["again"].append(SAME if right else f"stopped at report {stop} of {steps}: another result")
+        result["again"].append(
+            SAME if right else f"stopped at report {stop} of {steps}: another result"
+        )
     return result
 
 
@@ -297,7 +304,9 @@ def all_cases() -> Iterator[Case]:
         yield Case(name, partial(run_commands, commands=commands, interrupted=again), "s" in marks)
         if "t" in marks:
             tiled = [[*commands[0], *cases.TILES], *commands[1:]]
-            yield Case(f"{name}@tiles", partial(run_commands, commands=tiled, interrupted=again), False)
+            yield Case(
+                f"{name}@tiles", partial(run_commands, commands=tiled, interrupted=again), False
+            )
     for name, call in cases.CALLS.items():
         yield Case(f"python/{name}", partial(run_call, call=call), False)
     for name, stopped in cases.STOPPED.items():
@@ -307,7 +316,11 @@ def all_cases() -> Iterator[Case]:
 def table() -> Iterator[tuple[str, str, list[list[str]]]]:
     """Yield the name, the marks and the commands of each case of goldens.txt."""
     lines = TABLE.read_text(encoding="utf-8").replace("\\\n", "").splitlines()
-    rows = [(line[:20].strip(), line[20:25].strip(), line[25:]) for line in lines if line and line[0] != "#"]
+    rows = [
+        (line[:20].strip(), line[20:25].strip(), line[25:])
+        for line in lines
+        if line and line[0] != "#"
+    ]
     starts = [i for i, (name, *_) in enumerate(rows) if name]
     for start, end in zip(starts, [*starts[1:], len(rows)], strict=True):
         name, marks, _ = rows[start]
@@ -321,7 +334,11 @@ def machine(isa: str | None) -> dict[str, str]:
     """Return what bits depend on; `isa` is the kernels' instruction set unless it is the fastest."""
     info = Path("/proc/cpuinfo")
     rows = dict(re.findall(r"(?m)^([\w ]+?)\s*: (.*)$", info.read_text() if info.exists() else ""))
-    flags = [flag for flag in ("fma", "avx2", "avx512f", "avx512bw") if flag in rows.get("flags", "").split()]
+    flags = [
+        flag
+        for flag in ("fma", "avx2", "avx512f", "avx512bw")
+        if flag in rows.get("flags", "").split()
+    ]
     model = [rows.get(key, "") for key in ("vendor_id", "cpu family", "model")]
     chosen = [f"{name}={os.environ[name]}" for name in CHOOSING if os.environ.get(name)]
     versions = [f"{name} {version(name)}" for name in ("numpy", "pillow", "plyfile", "torch")]
@@ -367,8 +384,12 @@ def run_all(chosen: list[Case], root: Path, jobs: int, isa: str | None) -> dict[
         child, status, used = os.wait4(-1, 0)
         case, began = running.pop(child)
         line = root / f"{case.name.replace('/', '-')}.line"
-        results[case.name] = json.loads(line.read_text()) if not status else {"failed": ["the runner failed"]}
-        seconds = f"{time.monotonic() - began:.1f} s, {used.ru_utime + used.ru_stime:.1f} s of CPU time"
+        results[case.name] = (
+            json.loads(line.read_text()) if not status else {"failed": ["the runner failed"]}
+        )
+        seconds = (
+            f"{time.monotonic() - began:.1f} s, {used.ru_utime + used.ru_stime:.1f} s of CPU time"
+        )
         print(f"{case.name}: {seconds}", flush=True)
     if tree(inputs) != before:
         results["inputs"] = {"failed": ["a command has changed an input"]}
@@ -388,7 +409,9 @@ def run_case(case: Case, root: Path) -> None:
 
 
 def tree(folder: Path) -> dict[str, str]:
-    return {str(path): digest(path.read_bytes()) for path in sorted(folder.rglob("*")) if path.is_file()}
+    return {
+        str(path): digest(path.read_bytes()) for path in sorted(folder.rglob("*")) if path.is_file()
+    }
 
 
 _HASH = re.compile(r"-[0-9a-f]{16}(?=\.)")
@@ -429,22 +452,33 @@ def written(record: Found) -> str:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+    )
     add = parser.add_argument
     add("action", choices=["record", "compare"])
-    add("--only", metavar="PATTERN", default="", help="cases whose name matches this regular expression")
+    add(
+        "--only",
+        metavar="PATTERN",
+        default="",
+        help="cases whose name matches this regular expression",
+    )
     add("--slice", action="store_true", help="the cases of `make test`")
     add("--to", "--with", dest="record", type=Path, default=RECORD, help="file of the record")
     add("--keep", type=Path, metavar="DIR", help="keep everything that was written in a new folder")
     add("--jobs", type=int, default=os.cpu_count() or 1, help="cases at a time")
     add("--isa", help="instruction set of the rasteriser and the trainer: avx2, portable")
     asked = parser.parse_args()
-    chosen = [c for c in all_cases() if re.search(asked.only, c.name) and (c.sliced or not asked.slice)]
+    chosen = [
+        c for c in all_cases() if re.search(asked.only, c.name) and (c.sliced or not asked.slice)
+    ]
     with tempfile.TemporaryDirectory(prefix="goldens") as temporary:
         root = asked.keep or Path(temporary)
         root.mkdir(parents=True, exist_ok=asked.keep is None)
         results = run_all(chosen, root.resolve(), asked.jobs, asked.isa)
-    failed = [f"{name}: {text}" for name, line in results.items() for text in line.pop("failed", [])]
+    failed = [
+        f"{name}: {text}" for name, line in results.items() for text in line.pop("failed", [])
+    ]
     here = {"machine": machine(asked.isa), "cases": results}
     known = json.loads(asked.record.read_text()) if asked.record.exists() else None
     if asked.action == "record":
@@ -468,7 +502,9 @@ def main() -> int:
         for name, line in results.items():
             was = known["cases"].get(name)
             if "files" in line:
-                lines = ["is not in the record"] if was is None else differences(was, line, elsewhere)
+                lines = (
+                    ["is not in the record"] if was is None else differences(was, line, elsewhere)
+                )
                 failed += [f"{name}: {text}" for text in lines]
         if len(chosen) == len(list(all_cases())):
             failed += [f"{name}: has no case" for name in known["cases"].keys() - results.keys()]

@@ -106,7 +106,9 @@ TRAITS: dict[str, Trait] = {
         hide=("ffmpeg",),
     ),
     "adapter": Trait(_always, files=r"adapters\(\)", variables=_WITHOUT_DRIVERS),
-    "browser": Trait(_always, files="from helpers.browser import", hide=BROWSERS, variables=_WITHOUT_BROWSER),
+    "browser": Trait(
+        _always, files="from helpers.browser import", hide=BROWSERS, variables=_WITHOUT_BROWSER
+    ),
     "node": Trait(
         partial(_has, "node"),
         files="from helpers.peers import",
@@ -131,7 +133,11 @@ TRAITS: dict[str, Trait] = {
     "fonts": Trait(
         _always,
         tests=("tests/cli/test_pictures.py",),
-        variables={"FONTCONFIG_FILE": NOWHERE, "FONTCONFIG_PATH": NOWHERE, "XDG_DATA_DIRS": NOWHERE},
+        variables={
+            "FONTCONFIG_FILE": NOWHERE,
+            "FONTCONFIG_PATH": NOWHERE,
+            "XDG_DATA_DIRS": NOWHERE,
+        },
     ),
     "processor": Trait(
         _always,
@@ -140,10 +146,16 @@ TRAITS: dict[str, Trait] = {
     ),
     "locale": Trait(
         _always,
-        tests=("tests/cli/test_character_sets.py", "tests/io/test_tables.py", "tests/io/test_clouds.py"),
+        tests=(
+            "tests/cli/test_character_sets.py",
+            "tests/io/test_tables.py",
+            "tests/io/test_clouds.py",
+        ),
         variables={"LC_ALL": "C", "LANG": "C"},
     ),
-    "time zone": Trait(_always, tests=("tests/cli/test_info.py",), variables={"TZ": "Pacific/Kiritimati"}),
+    "time zone": Trait(
+        _always, tests=("tests/cli/test_info.py",), variables={"TZ": "Pacific/Kiritimati"}
+    ),
     "umask": Trait(partial(hasattr, os, "fork"), tests=_FILES, umask=0o077),
     "root": Trait(_is_root, tests=(*_FILES, "tests/cli/test_outputs.py"), prefix=_NOT_ROOT),
 }
@@ -180,8 +192,12 @@ def other_machine(traits: Sequence[Trait], folder: Path) -> dict[str, str]:
         found["PATH"] = str(folder / "bin")
     if modules := {name for trait in traits for name in trait.modules}:
         (folder / "site").mkdir()
-        (folder / "site" / "sitecustomize.py").write_text(_HIDING.format(names=modules), encoding="utf-8")
-        found["PYTHONPATH"] = os.pathsep.join(filter(None, [str(folder / "site"), found.get("PYTHONPATH")]))
+        (folder / "site" / "sitecustomize.py").write_text(
+            _HIDING.format(names=modules), encoding="utf-8"
+        )
+        found["PYTHONPATH"] = os.pathsep.join(
+            filter(None, [str(folder / "site"), found.get("PYTHONPATH")])
+        )
     return found
 
 
@@ -190,12 +206,23 @@ def run(traits: Sequence[Trait]) -> int:
     prefix = [word for trait in traits for word in trait.prefix]
     umask = max(trait.umask for trait in traits)
     wanted = list(dict.fromkeys(test for trait in traits for test in slice_of(trait)))
-    commands = [[*word.split(), "--jobs", "1"] for word in wanted if word.startswith("tests/goldens.py")]
+    commands = [
+        [*word.split(), "--jobs", "1"] for word in wanted if word.startswith("tests/goldens.py")
+    ]
     tests = [word for word in wanted if not word.startswith("tests/goldens.py")]
     if tests:
         files = {test.partition("::")[0] for test in tests}
-        processes = str(_PROCESSES if len(files) > 1 else 0)  # a file stays in one, with its fixtures
-        options = ["-p", "no:cacheprovider", "--no-header", "--numprocesses", processes, "--dist", "loadfile"]
+        # a file stays in one, with its fixtures
+        processes = str(_PROCESSES if len(files) > 1 else 0)
+        options = [
+            "-p",
+            "no:cacheprovider",
+            "--no-header",
+            "--numprocesses",
+            processes,
+            "--dist",
+            "loadfile",
+        ]
         commands.append(["-m", "pytest", *options, *tests])
     with tempfile.TemporaryDirectory(prefix="machine") as folder:
         environment = other_machine(traits, Path(folder))
@@ -211,7 +238,9 @@ def main(words: Sequence[str]) -> int:
     action, *names = words or ["list"]
     if action == "list":
         for name, trait in TRAITS.items():
-            print(f"{name:10} {'here' if trait.there() else 'not here':9} {' '.join(slice_of(trait))}")
+            print(
+                f"{name:10} {'here' if trait.there() else 'not here':9} {' '.join(slice_of(trait))}"
+            )
         return 0
     if action == "without":
         return run([TRAITS[name] for name in names or FRESH])

@@ -153,7 +153,9 @@ def _renewed_figures(text: str, printed: str) -> tuple[str, list[str]]:
     def renewed(found: re.Match[str]) -> str:
         old = _values(found[0])
         known = pairs if len(old) > 1 else re.findall(_FIGURE, printed)
-        like = [one for one in known if list(map(_decimals, _values(one))) == list(map(_decimals, old))]
+        like = [
+            one for one in known if list(map(_decimals, _values(one))) == list(map(_decimals, old))
+        ]
 
         def distance(one: str) -> float:
             return sum(abs(_number(a) - _number(b)) for a, b in zip(_values(one), old, strict=True))
@@ -207,7 +209,9 @@ def main() -> int:
     )
     parser.add_argument("do", choices=("compare", "record"))
     parser.add_argument("--page", action="append", help="only this page")
-    parser.add_argument("--quick", action="store_true", help="only what takes less than about 20 seconds")
+    parser.add_argument(
+        "--quick", action="store_true", help="only what takes less than about 20 seconds"
+    )
     given, wrong = parser.parse_args(), 0
     for page in given.page or pages():
         for passage in passages(page):

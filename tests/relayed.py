@@ -13,7 +13,10 @@ LIMITS = {"photos": 10, "up": 15, "images": 13}
 
 def relayed(package: Path, name: str) -> set[Path]:
     """Return the files in which a parameter or keyword argument has this name."""
-    trees = {path: ast.parse(path.read_text(encoding="utf-8"), str(path)) for path in package.rglob("*.py")}
+    trees = {
+        path: ast.parse(path.read_text(encoding="utf-8"), str(path))
+        for path in package.rglob("*.py")
+    }
     named = ast.arg | ast.keyword
     return {
         path

@@ -101,7 +101,10 @@ def test_results_print_as_one_short_line() -> None:
     ("typed", "given"),
     [
         (["-n", 200], {"count": 200}),
-        (["-r", 6, "--method", "fast", "--views", "made"], {"ratio": 6, "method": "fast", "views": "made"}),
+        (
+            ["-r", 6, "--method", "fast", "--views", "made"],
+            {"ratio": 6, "method": "fast", "views": "made"},
+        ),
         (["-r", 5, "--no-views"], {"ratio": 5, "blind": True}),
         (["-r", 7, "--preset", "paper"], {"ratio": 7, "method": "paper"}),
         (["--fit", "20kB"], {"fit": "20kB"}),
@@ -129,14 +132,28 @@ def test_simplify_equals_the_command(
 def test_distill_equals_the_command(
     typed: list[object], given: dict[str, object], command_line: CommandLine, folder: Path
 ) -> None:
-    ask = ("distill", "ball.ply", "-o", "run", "--size", 64, "--seed", 3, "--focus", "far", "--no-page")
+    ask = (
+        "distill",
+        "ball.ply",
+        "-o",
+        "run",
+        "--size",
+        64,
+        "--seed",
+        3,
+        "--focus",
+        "far",
+        "--no-page",
+    )
     succeeds(command_line, folder, *ask, *typed)
     settings = {"focus": "far"} | {name: given.pop(name) for name in [*given] if "." in name}
     ours = g2ard.distill(folder / "ball.ply", size=64, seed=3, settings=settings, **given)  # type: ignore
     assert_same_bits(ours.splats, g2ard.load(folder / "run" / "scene.ply"), folder / "ours.ply")
     told = json.loads((folder / "run" / "report.json").read_text())
     rounds = ours.report.as_dict()["rounds"]
-    assert [r["recover"][-1]["loss"] for r in rounds] == [r["recover"][-1]["loss"] for r in told["rounds"]]
+    assert [r["recover"][-1]["loss"] for r in rounds] == [
+        r["recover"][-1]["loss"] for r in told["rounds"]
+    ]
     score = g2ard.evaluate(ours.splats, ours.held_out)
     assert score.psnr == pytest.approx(told["scores"]["recovered"]["psnr"], abs=1e-9)
 

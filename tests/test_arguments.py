@@ -35,7 +35,12 @@ COLOUR = "expected 3 numbers from 0 to 1"
 WRONG: list[tuple[str, dict[str, Any], str, str]] = [
     ("distill", {"format": "foo"}, "format", "expected one of ply, sog"),
     ("distill", {"preset": "nope"}, "preset", "nope"),
-    ("recover", {"targets": None, "views": VIEWS, "teacher": BALL, "preset": "nope"}, "preset", "nope"),
+    (
+        "recover",
+        {"targets": None, "views": VIEWS, "teacher": BALL, "preset": "nope"},
+        "preset",
+        "nope",
+    ),
     ("distill", {"background": (300, 0, 0)}, "background", COLOUR),
     (
         "distill",
@@ -52,8 +57,18 @@ WRONG: list[tuple[str, dict[str, Any], str, str]] = [
     ("recover", {"targets": Own(255 * IMAGES)}, "targets", "divide by 255, or pass uint8"),
     ("recover", {"targets": Own(IMAGES * np.nan)}, "targets", "from 0 to 1, got nan to nan"),
     ("recover", {"targets": Own(IMAGES[:3])}, "targets", "view 3 (view_003) has no image"),
-    ("recover", {"targets": Own(IMAGES.transpose(0, 3, 1, 2))}, "targets", "move the channels to the end"),
-    ("recover", {"targets": Own(IMAGES.astype(int))}, "targets", "expected uint8, or floats from 0 to 1"),
+    (
+        "recover",
+        {"targets": Own(IMAGES.transpose(0, 3, 1, 2))},
+        "targets",
+        "move the channels to the end",
+    ),
+    (
+        "recover",
+        {"targets": Own(IMAGES.astype(int))},
+        "targets",
+        "expected uint8, or floats from 0 to 1",
+    ),
     ("adapt", {"targets": Own(255 * IMAGES)}, "targets", "divide by 255, or pass uint8"),
     ("evaluate", {"targets": VIEWS}, "targets", "pass g2ard.Photos(cameras, images)"),
     ("render", {"camera": VIEWS}, "camera", "expected Camera, got Cameras(8 views)"),
@@ -143,7 +158,9 @@ def _cases() -> Iterator[tuple[str, str]]:
 
 
 @pytest.mark.parametrize(("name", "wrong", "parameter", "words"), WRONG)
-def test_invalid_arguments_are_named(name: str, wrong: dict[str, Any], parameter: str, words: str) -> None:
+def test_invalid_arguments_are_named(
+    name: str, wrong: dict[str, Any], parameter: str, words: str
+) -> None:
     with pytest.raises(g2ard.G2ardError) as caught:
         getattr(g2ard, name)(**{**VALID.get(name, {}), **wrong})
     assert str(caught.value.parameter).rpartition(".")[2] == parameter.rpartition(".")[2]
@@ -153,10 +170,14 @@ def test_invalid_arguments_are_named(name: str, wrong: dict[str, Any], parameter
 
 @pytest.mark.parametrize("white", [[1, 1, 1], np.ones(3), np.ones(3, np.float32)])
 def test_a_colour_is_any_three_numbers(white: Any) -> None:
-    targets = [g2ard.TeacherRenders(BALL, VIEWS, background=colour) for colour in (white, (1, 1, 1))]
+    targets = [
+        g2ard.TeacherRenders(BALL, VIEWS, background=colour) for colour in (white, (1, 1, 1))
+    ]
     np.testing.assert_array_equal(targets[0][0], targets[1][0])
     ours, theirs = (
-        g2ard.recover(SMALL, targets[1], steps=2, background=colour, seed=np.int64(1)).splats.fingerprint()
+        g2ard.recover(
+            SMALL, targets[1], steps=2, background=colour, seed=np.int64(1)
+        ).splats.fingerprint()
         for colour in (white, (1.0, 1.0, 1.0))
     )
     assert ours == theirs
@@ -169,7 +190,8 @@ def test_recover_takes_settings_by_name() -> None:
         whole.splats.fingerprint()
     )
     rates = g2ard.RecoverConfig(schedule=g2ard.preset("paper").recover.schedule)
-    assert g2ard.recover(SMALL, TARGETS, rates, steps=3).report.multiplier == 1  # keeps the schedule
+    # keeps the schedule
+    assert g2ard.recover(SMALL, TARGETS, rates, steps=3).report.multiplier == 1
     decided: dict[str, Any] = {"views": VIEWS, "teacher": BALL}
     by_name = g2ard.recover(SMALL, **decided, steps=3, schedule="fast")
     by_path = g2ard.recover(SMALL, **decided, settings={"recover.steps": 3, "schedule": "fast"})
@@ -191,7 +213,9 @@ def test_every_public_function_answers_an_unknown_keyword_by_the_nearest() -> No
             if name in ("save", "save_views", "convert", "save_levels", "save_tileset"):
                 continue  # options of formats are answered by their formats
             wrong = f"{keyword[:-1]}x{keyword[-1]}"
-            with pytest.raises((TypeError, g2ard.InputError), match=rf"'{wrong}'; did you mean {keyword}\?"):
+            with pytest.raises(
+                (TypeError, g2ard.InputError), match=rf"'{wrong}'; did you mean {keyword}\?"
+            ):
                 function(**first, **{wrong: 1})
             asked += 1
     assert asked > 100
@@ -199,7 +223,9 @@ def test_every_public_function_answers_an_unknown_keyword_by_the_nearest() -> No
 
 def test_editors_complete_what_people_set() -> None:
     for function in (g2ard.distill, g2ard.recover):
-        assert {"steps", "background", "schedule", "seed"} <= {*inspect.signature(function).parameters}
+        assert {"steps", "background", "schedule", "seed"} <= {
+            *inspect.signature(function).parameters
+        }
 
 
 BYTES = np.rint(IMAGES * 255).astype(np.uint8)
@@ -241,7 +267,9 @@ def test_files_and_alpha_as_images(tmp_path: Path) -> None:
     for given in (paths, [str(path) for path in paths]):
         photos = g2ard.Photos(VIEWS, given)
         assert np.abs(photos[3] - IMAGES[3]).max() < 0.003
-        assert photos.source == g2ard.Photos(VIEWS, paths).source != g2ard.Photos(VIEWS, BYTES).source
+        assert (
+            photos.source == g2ard.Photos(VIEWS, paths).source != g2ard.Photos(VIEWS, BYTES).source
+        )
     clear = np.concatenate([BYTES, np.zeros((*BYTES.shape[:3], 1), np.uint8)], axis=3)
     assert g2ard.Photos(VIEWS, clear, background=(1, 0.5, 0))[0][0, 0].tolist() == [1, 0.5, 0]
 
@@ -261,7 +289,10 @@ def test_wrong_values_are_refused(
     monkeypatch.chdir(files)
     function = getattr(g2ard, name)
     annotation = str(inspect.signature(function).parameters[parameter].annotation)
-    others = {**VALID[name], **({"ratio": None} if parameter in BUDGETS and "ratio" in VALID[name] else {})}
+    others = {
+        **VALID[name],
+        **({"ratio": None} if parameter in BUDGETS and "ratio" in VALID[name] else {}),
+    }
     for value in _wrong(name, parameter, annotation):
         with pytest.raises(g2ard.G2ardError) as caught:
             function(**{**others, parameter: value})

@@ -18,7 +18,9 @@ from helpers.project import ROOT
 from helpers.scenes import checkered_ball
 
 PAGES = sorted(
-    page for pattern in ("*.md", "docs/**/*.md", "benchmarks/record/*.md") for page in ROOT.glob(pattern)
+    page
+    for pattern in ("*.md", "docs/**/*.md", "benchmarks/record/*.md")
+    for page in ROOT.glob(pattern)
 )
 NAMES = [str(page.relative_to(ROOT)) for page in PAGES]
 BALL = checkered_ball(400)
@@ -51,11 +53,17 @@ def test_relative_links_lead_somewhere(name: str) -> None:
 
 
 def test_the_documentation_stays_short() -> None:
-    pages = [ROOT / name for name in NAMES if not name.startswith(("benchmarks/", "CHANGELOG", "SECURITY"))]
+    pages = [
+        ROOT / name
+        for name in NAMES
+        if not name.startswith(("benchmarks/", "CHANGELOG", "SECURITY"))
+    ]
     assert sum(len(page.read_text(encoding="utf-8").split()) for page in pages) <= 36_000
 
 
-CURRENT = [n for n in NAMES if not n.startswith(("benchmarks/record", "docs/decisions/", "CHANGELOG"))]
+CURRENT = [
+    n for n in NAMES if not n.startswith(("benchmarks/record", "docs/decisions/", "CHANGELOG"))
+]
 
 
 @cache
@@ -81,20 +89,26 @@ def test_options_of_commands_in_sentences_exist(name: str, command_line: Command
 
 
 def test_a_wrong_option_would_be_found(command_line: CommandLine) -> None:
-    assert unknown_in("Type `g2ard simplify a.ply -r 10 --ratioo 9`.", command_line) == ["simplify --ratioo"]
+    assert unknown_in("Type `g2ard simplify a.ply -r 10 --ratioo 9`.", command_line) == [
+        "simplify --ratioo"
+    ]
 
 
 def test_make_targets_named_exist() -> None:
     makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
     targets = set(re.findall(r"(?m)^([a-z-]+):", makefile))
     for name in CURRENT:
-        for target in re.findall(r"(?m)(?:`|^)make ([a-z-]+)", (ROOT / name).read_text(encoding="utf-8")):
+        for target in re.findall(
+            r"(?m)(?:`|^)make ([a-z-]+)", (ROOT / name).read_text(encoding="utf-8")
+        ):
             assert target in targets, f"{name}: make {target}"
 
 
 @pytest.mark.parametrize("name", CURRENT)
 def test_python_examples_parse_and_their_names_exist(name: str) -> None:
-    for block in re.findall(r"(?ms)^```python\n(.*?)^```", (ROOT / name).read_text(encoding="utf-8")):
+    for block in re.findall(
+        r"(?ms)^```python\n(.*?)^```", (ROOT / name).read_text(encoding="utf-8")
+    ):
         for node in ast.walk(ast.parse(block)):
             if (
                 isinstance(node, ast.Attribute)
@@ -108,7 +122,9 @@ def test_python_examples_parse_and_their_names_exist(name: str) -> None:
 def short(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Run in a folder of its own, where distillations are small."""
     distill, quick = g2ard.distill, {"steps": 5, "size": 48, "settings": {"focus": "far"}}
-    monkeypatch.setattr(g2ard, "distill", lambda *given, **named: distill(*given, **{**named, **quick}))
+    monkeypatch.setattr(
+        g2ard, "distill", lambda *given, **named: distill(*given, **{**named, **quick})
+    )
     monkeypatch.chdir(tmp_path)
 
 
@@ -147,7 +163,9 @@ def test_the_guide_to_own_views_runs(short: None) -> None:
 
 def test_the_rasteriser_guide_trains_a_scene(short: None) -> None:
     names = run_guide("docs/how-to/rasteriser.md")
-    before, after = (g2ard.evaluate(names[scene], names["targets"]).psnr for scene in ("small", "trained"))
+    before, after = (
+        g2ard.evaluate(names[scene], names["targets"]).psnr for scene in ("small", "trained")
+    )
     assert after > before
 
 
@@ -189,7 +207,9 @@ def test_plots_match_the_recorded_rows() -> None:
     folder = ROOT / "docs" / "plots"
     assert sorted(drawn) == sorted(p.name for p in folder.glob("*.svg"))
     for name, svg in drawn.items():
-        assert svg == (folder / name).read_text(encoding="utf-8"), f"{name}: run python -m benchmarks.plots"
+        assert svg == (folder / name).read_text(encoding="utf-8"), (
+            f"{name}: run python -m benchmarks.plots"
+        )
 
 
 def test_the_readme_names_every_command_and_scene_format() -> None:
@@ -200,7 +220,12 @@ def test_the_readme_names_every_command_and_scene_format() -> None:
     table = "\n".join(line for line in text.splitlines() if line.startswith("| `"))
     assert [name for name in COMMANDS if f"`{name}`" not in table] == []
     scenes = text.split("\n## Formats\n")[1].split("\n## ")[0]
-    names = {"sog": "SOG", "compressed_ply": ".compressed.ply", "usd": "OpenUSD", "tiles": "folders of tiles"}
+    names = {
+        "sog": "SOG",
+        "compressed_ply": ".compressed.ply",
+        "usd": "OpenUSD",
+        "tiles": "folders of tiles",
+    }
     kinds = [name for name, kind in KINDS.items() if kind == "splats"]
     assert [name for name in kinds if names.get(name, f".{name}") not in scenes] == []
 

@@ -86,10 +86,14 @@ class Reader:
         for before, word in zip(["", *arguments], arguments, strict=False):
             if before != "-o":
                 provide(word, self.folder, self.page, self.store)
-        assert program in (["g2ard"], ["python", "-m", "benchmarks"]), f"{self.page}: `{command}` is not run"
+        assert program in (["g2ard"], ["python", "-m", "benchmarks"]), (
+            f"{self.page}: `{command}` is not run"
+        )
         small = ["--config", "small.toml"] if f"[{arguments[0]}]" in SHRUNK else []
         if re.fullmatch(STUDIES, command):
-            assert arguments[1].endswith(".toml") or (DEFINITIONS / f"{arguments[1]}.toml").is_file()
+            assert (
+                arguments[1].endswith(".toml") or (DEFINITIONS / f"{arguments[1]}.toml").is_file()
+            )
             small = ["--print-config"]
         if arguments[0] == "distill" and self.page != PAGED and "page:" not in command:
             small.append("--no-page")
@@ -135,7 +139,9 @@ def test_the_commands_of_a_page_run(
 def test_every_reason_and_stand_in_is_used() -> None:
     texts = {page: (ROOT / page).read_text(encoding="utf-8") for page in PAGES}
     commands = [command for text in texts.values() for command in commands_of(text)]
-    assert [no for no in NOT_RUN if not any(re.fullmatch(no, command) for command in commands)] == []
+    assert [
+        no for no in NOT_RUN if not any(re.fullmatch(no, command) for command in commands)
+    ] == []
     everything = "\n".join(texts.values())
     unused = [name for name in (*STAND_INS, *PLACEHOLDERS) if name not in everything]
     assert unused == []

@@ -73,7 +73,9 @@ LINE: goldens.Found = {
 def test_what_depends_on_a_processor_counts_on_the_same_alone(
     change: dict[str, Any], anywhere: bool | None
 ) -> None:
-    there, here = (bool(goldens.differences(LINE, LINE | change, elsewhere)) for elsewhere in (True, False))
+    there, here = (
+        bool(goldens.differences(LINE, LINE | change, elsewhere)) for elsewhere in (True, False)
+    )
     assert (there, here) == (anywhere or False, anywhere is not None)
 
 

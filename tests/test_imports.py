@@ -59,7 +59,9 @@ def test_packages_import_only_layers_below() -> None:
             continue
         package = module.split(".")[1]
         below = LAYERS[: LAYERS.index(package) + 1]
-        wrong += [f"{module} imports {name}" for name in imported(path) if name.split(".")[1] not in below]
+        wrong += [
+            f"{module} imports {name}" for name in imported(path) if name.split(".")[1] not in below
+        ]
     assert wrong == []
 
 
@@ -76,7 +78,9 @@ def test_architecture_names_files_that_exist() -> None:
         for path in (ROOT.parent / name).rglob("*")
     ]
     named = set(re.findall(r"`([\w/.-]+\.(?:py|rs|pyi))`", text))
-    assert [name for name in sorted(named) if not any(path.endswith(f"/{name}") for path in code)] == []
+    assert [
+        name for name in sorted(named) if not any(path.endswith(f"/{name}") for path in code)
+    ] == []
 
 
 def rust_modules(source: Path) -> dict[str, Path]:
@@ -96,7 +100,9 @@ def rust_paths(text: str) -> Iterator[str]:
     while pending:
         path = re.sub(r"\s", "", pending.pop())
         if opened := re.match(r"([\w:]*)\{(.*)\}", path):
-            pending += [opened[1] + part for part in re.findall(r"(?:[^,{}]|\{[^}]*\})+", opened[2])]
+            pending += [
+                opened[1] + part for part in re.findall(r"(?:[^,{}]|\{[^}]*\})+", opened[2])
+            ]
         else:
             yield path.partition(";")[0]
     yield from re.findall(r"\b(?:crate|super)(?:::\w+)+", text)
@@ -123,13 +129,17 @@ def test_no_import_cycles(crate: str) -> None:
     assert len(known) > 5
     for module, path in known.items():
         if crate == "python":
-            targets = {name if name in known else name.rpartition(".")[0] for name in imported(path)}
+            targets = {
+                name if name in known else name.rpartition(".")[0] for name in imported(path)
+            }
             edges[module] = targets & known.keys() - {module, "g2ard"}
         else:
             edges[module] = rust_imports(known, module)
     tops = [module for module in edges if not edges[module]]
     while tops:  # remove modules that import nothing, until none is left
-        edges = {module: targets - set(tops) for module, targets in edges.items() if module not in tops}
+        edges = {
+            module: targets - set(tops) for module, targets in edges.items() if module not in tops
+        }
         tops = [module for module in edges if not edges[module]]
     assert not edges
 
@@ -137,7 +147,9 @@ def test_no_import_cycles(crate: str) -> None:
 def test_modules_are_imported_by_their_own_names() -> None:
     """`from g2ard.io import judge` would import all that the package's face imports."""
     known = modules()
-    faces = {name for name, path in known.items() if path.name == "__init__.py" and [*imported(path)]}
+    faces = {
+        name for name, path in known.items() if path.name == "__init__.py" and [*imported(path)]
+    }
     wrong = [
         f"{module} imports {node.module}.{alias.name}"
         for module, path in known.items()
@@ -154,6 +166,8 @@ def test_stages_do_not_import_each_other() -> None:
     own = {name: ".".join(name.split(".")[:3]) for name in stages}
     named = ((module, name) for module, path in stages.items() for name in imported(path))
     wrong = [
-        f"{m} imports {n}" for m, n in named if n.startswith("g2ard.stages.") and not n.startswith(own[m])
+        f"{m} imports {n}"
+        for m, n in named
+        if n.startswith("g2ard.stages.") and not n.startswith(own[m])
     ]
     assert wrong == []

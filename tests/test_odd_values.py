@@ -37,10 +37,13 @@ def test_quaternions_of_any_length_recover_like_unit_ones(engine: Any, length: f
 @pytest.mark.parametrize("length", [1e-24, 1e37])
 def test_quaternions_of_any_length_render_simplify_and_select_like_unit_ones(length: float) -> None:
     scaled = replace(BALL, quats=(BALL.quats * np.float32(length)).astype(np.float32))
-    np.testing.assert_allclose(render(scaled, VIEWS[0]).image, render(BALL, VIEWS[0]).image, atol=1e-4)
+    np.testing.assert_allclose(
+        render(scaled, VIEWS[0]).image, render(BALL, VIEWS[0]).image, atol=1e-4
+    )
     near, odd = (g2ard.simplify(scene, ratio=4).splats for scene in (BALL, scaled))
     scores = [g2ard.evaluate(scene, TeacherRenders(BALL, VIEWS)).psnr for scene in (near, odd)]
-    assert abs(scores[1] - scores[0]) < 1, scores  # rounding decides which of equal merges come first
+    # rounding decides which of equal merges come first
+    assert abs(scores[1] - scores[0]) < 1, scores
     orders = [g2ard.select(scene, VIEWS, 2).order.tolist() for scene in (BALL, scaled)]
     assert orders[0] == orders[1]
 
@@ -67,7 +70,9 @@ def rotated(R: Any, last: Any = (0, 0, 0, 1)) -> NDArray[np.float64]:
         (rotated(np.eye(3), (0.1, 0, 0, 1)), "last row"),
     ],
 )
-def test_poses_that_are_not_rigid_are_refused_with_their_view(poses: NDArray[np.float64], fault: str) -> None:
+def test_poses_that_are_not_rigid_are_refused_with_their_view(
+    poses: NDArray[np.float64], fault: str
+) -> None:
     with pytest.raises(InputError, match=fault) as caught:
         replace(VIEWS, viewmats=poses)
     assert (caught.value.index, caught.value.item) == (2, "view")
@@ -158,7 +163,9 @@ def test_long_names_can_be_written(tmp_path: Path, length: int, letter: str) -> 
 
 def test_hidden_names_are_unique_and_fit() -> None:
     names = ["a" * n + "ü" * m for n in (1, 200, 240, 250) for m in (0, 1, 5)]
-    hidden = {hidden_name(name, ending) for name in names for ending in (".lock", ".unfinished", ".tiles")}
+    hidden = {
+        hidden_name(name, ending) for name in names for ending in (".lock", ".unfinished", ".tiles")
+    }
     assert len(hidden) == 36
     assert max(len(name.encode()) for name in hidden) <= 255
 
@@ -173,7 +180,11 @@ def test_failures_of_usd_core_are_output_errors(
     def full(*_: Any) -> None:
         if error == "tf":
             pxr.Tf.RaiseRuntimeError("no space left on device")
-        raise (OSError(28, "No space left on device") if error == "os" else RuntimeError("no space left"))
+        raise (
+            OSError(28, "No space left on device")
+            if error == "os"
+            else RuntimeError("no space left")
+        )
 
     monkeypatch.setattr(usd, "_save", full)
     path = tmp_path / "a.usdc"

@@ -13,7 +13,9 @@ DOCKERFILE = (ROOT / "Dockerfile").read_text(encoding="utf-8")
 
 
 def test_the_container_is_small_and_without_root() -> None:
-    words = [line.split(maxsplit=1) for line in DOCKERFILE.splitlines() if line[:1] not in ("", "#")]
+    words = [
+        line.split(maxsplit=1) for line in DOCKERFILE.splitlines() if line[:1] not in ("", "#")
+    ]
     steps = [name for name, _ in words]
     (base,) = (rest for name, rest in words if name == "FROM")
     assert re.fullmatch(r"python:3\.\d+-slim", base)
@@ -32,7 +34,9 @@ def test_the_container_builds_and_runs() -> None:
     if not list((ROOT / "dist").glob("*.whl")):
         pytest.skip("no wheel in dist (make wheel-linux)")
     subprocess.run([docker, "build", "--quiet", "--tag", "g2ard-test", str(ROOT)], check=True)
-    said = subprocess.run([docker, "run", "--rm", "g2ard-test", "--version"], capture_output=True, text=True)
+    said = subprocess.run(
+        [docker, "run", "--rm", "g2ard-test", "--version"], capture_output=True, text=True
+    )
     assert said.stdout.startswith("g2ard ")
 
 

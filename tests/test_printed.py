@@ -49,7 +49,9 @@ def test_lines_and_figures_that_differ_are_found(told: str, differences: int) ->
 
 
 def test_figures_of_a_sentence_are_found_and_renewed() -> None:
-    sentence = printed.Passage("a.md", "", False, "*fox* rises from 15.37 to 31.29 dB with 20,000 in 24 s.\n")
+    sentence = printed.Passage(
+        "a.md", "", False, "*fox* rises from 15.37 to 31.29 dB with 20,000 in 24 s.\n"
+    )
     assert sentence.renewed("43 photos → 20,000\n15.37 → 27.54 dB\n15.41 → 31.20 dB") == (
         "*fox* rises from 15.41 to 31.20 dB with 20,000 in 24 s.\n",
         [],
@@ -57,7 +59,9 @@ def test_figures_of_a_sentence_are_found_and_renewed() -> None:
     assert len(sentence.renewed("43 photos → 30,000\n15.41 → 32.20 dB")[1]) == 2
 
 
-def test_the_notebook_runs_without_its_scene(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_notebook_runs_without_its_scene(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A small ball prints the same lines with other figures."""
     notebook = notebooks.read()
     first = notebooks.code_of(notebook)[0]
@@ -66,7 +70,9 @@ def test_the_notebook_runs_without_its_scene(tmp_path: Path, monkeypatch: pytest
         monkeypatch.delenv(variable, raising=False)
     distill = g2ard.distill
     few = {"settings": {"focus": "far"}, "steps": 5, "size": 48}
-    monkeypatch.setattr(g2ard, "distill", lambda *given, **named: distill(*given, **{**named, **few}))
+    monkeypatch.setattr(
+        g2ard, "distill", lambda *given, **named: distill(*given, **{**named, **few})
+    )
     outputs = notebooks.execute(notebook, names := {}, tmp_path)
     assert len(names["result"].splats) == 60
     for cell, found in zip(notebooks.code_of(notebook), outputs, strict=True):

@@ -73,6 +73,8 @@ def footprint(training: Training, view: int, pixels: Tensor) -> Tensor:
     """Return (N,) how many of some pixels (H, W) each Gaussian touches, hidden or not, times a constant."""
     grey = torch.ones_like(training.values["sh0"], requires_grad=True)
     others = {name: value.detach() for name, value in training.values.items()}
-    image = training.rendered(view, _FOOTPRINT, **{**others, "sh0": grey, "shN": others["shN"][:, :0]})
+    image = training.rendered(
+        view, _FOOTPRINT, **{**others, "sh0": grey, "shN": others["shN"][:, :0]}
+    )
     (counts,) = torch.autograd.grad((image[..., 0] * pixels).sum(), grey)
     return counts[:, 0, 0]

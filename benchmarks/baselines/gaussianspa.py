@@ -38,7 +38,9 @@ class GaussianSpa:
             return 0.0
         if not len(self._goal):
             self._project(training)
-        return _DELTA / 2 * (training.values["logit_opacities"].sigmoid() - self._goal).square().sum()
+        return (
+            _DELTA / 2 * (training.values["logit_opacities"].sigmoid() - self._goal).square().sum()
+        )
 
     def after(self, training: Training, step: int) -> None:
         """Project at intervals, and cut the scene once."""

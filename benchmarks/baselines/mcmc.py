@@ -153,7 +153,9 @@ class _Training:
         start = {
             "means": points,
             "scales": (_SIZE * _distances(points)).clamp_min(1e-9).log()[:, None].repeat(1, 3),
-            "quats": torch.nn.functional.normalize(torch.randn(count, 4, device=points.device), dim=1),
+            "quats": torch.nn.functional.normalize(
+                torch.randn(count, 4, device=points.device), dim=1
+            ),
             "opacities": torch.logit(torch.full((count,), _OPACITY, device=points.device)),
             "sh0": colours,
             "shN": torch.zeros(count, (_SH_DEGREE + 1) ** 2 - 1, 3, device=points.device),
@@ -172,7 +174,9 @@ class _Training:
         self._strategy.check_sanity(self._values, self._optimizers)
         self._state = self._strategy.initialize_state()
 
-    def step(self, step: int, view: int, target: Tensor, mask: Tensor | None, background: Colour) -> None:
+    def step(
+        self, step: int, view: int, target: Tensor, mask: Tensor | None, background: Colour
+    ) -> None:
         """Take one step on a view, then let the strategy relocate and perturb Gaussians."""
         values = self._values
         known = (min(step // _STEPS_PER_DEGREE, _SH_DEGREE) + 1) ** 2 - 1
@@ -204,7 +208,11 @@ class _Training:
         from g2ard.stages.recover.rasterize import rasterize
 
         image, _, _ = rasterize(
-            **parameters, cameras=self._cameras, index=view, background=background, settings=self._settings
+            **parameters,
+            cameras=self._cameras,
+            index=view,
+            background=background,
+            settings=self._settings,
         )
         return image
 
@@ -265,7 +273,9 @@ class _Strategy:
             noise = torch.randn_like(values["means"]) * (gate * lr * _NOISE)[:, None]
             turns = _rotations(values["quats"])
             variances = (2 * values["scales"]).exp()
-            values["means"] += (turns @ (variances * (noise[:, None] @ turns)[:, 0])[..., None])[..., 0]
+            values["means"] += (turns @ (variances * (noise[:, None] @ turns)[:, 0])[..., None])[
+                ..., 0
+            ]
 
 
 def _device(gpu: bool) -> str:
@@ -289,7 +299,11 @@ def _strategy(gpu: bool, count: int, last_move: int) -> Any:
 
 
 def _rasterized(
-    parameters: dict[str, Tensor], cameras: Cameras, view: int, background: Any, settings: RasterSettings
+    parameters: dict[str, Tensor],
+    cameras: Cameras,
+    view: int,
+    background: Any,
+    settings: RasterSettings,
 ) -> Tensor:
     """Render one view (H, W, 3) with gsplat on an NVIDIA GPU, differentiably.
 

@@ -129,7 +129,8 @@ def _cost(
         x = rows.means[own] + np.einsum("nij,nj->ni", rows.axes[own], step)
         with np.errstate(divide="ignore"):  # a share of 0 has no weight
             logs = np.logaddexp(
-                np.log(share) + _log_density(rows, i, x), np.log1p(-share) + _log_density(rows, j, x)
+                np.log(share) + _log_density(rows, i, x),
+                np.log1p(-share) + _log_density(rows, j, x),
             )
         log_p += weight * logs
     between = rows.means[i] - rows.means[j]
@@ -166,7 +167,9 @@ def _rows(splats: Splats) -> _Rows:
     axes = rotation_matrices(splats.quats)
     sh = np.concatenate([splats.sh0, splats.shN], 1).astype(np.float64).reshape(len(splats), -1)
     alpha = splats.opacities.astype(np.float64)
-    return _Rows(splats.means.astype(np.float64), axes, splats.scales.astype(np.float64) ** 2, alpha, sh)
+    return _Rows(
+        splats.means.astype(np.float64), axes, splats.scales.astype(np.float64) ** 2, alpha, sh
+    )
 
 
 def _splats(rows: _Rows, like: Splats) -> Splats:

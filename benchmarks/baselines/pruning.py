@@ -10,7 +10,14 @@ from g2ard.scene.cameras import Cameras
 from g2ard.scene.shape import longer_axes
 from g2ard.scene.splats import Splats
 
-__all__ = ["global_significance", "importance", "keep_best", "largest_share", "optical_mass", "sample"]
+__all__ = [
+    "global_significance",
+    "importance",
+    "keep_best",
+    "largest_share",
+    "optical_mass",
+    "sample",
+]
 
 _VOLUME_POWER = 0.1
 _VOLUME_RANK = 0.9

@@ -25,7 +25,9 @@ _SINGULAR = 1e-7
 """Smallest eigenvalue of F with unit diagonal above rounding errors, since pixels are summed in float32."""
 
 
-def fisher(splats: Splats, cameras: Cameras, *, probes: int = _PROBES, seed: int = 0) -> NDArray[np.float64]:
+def fisher(
+    splats: Splats, cameras: Cameras, *, probes: int = _PROBES, seed: int = 0
+) -> NDArray[np.float64]:
     """Estimate (N, 6, 6) F = Σ g gᵀ over views, pixels and channels, g = ∂C/∂(mean, log scale).
 
     The gradient of an image weighted by random signs is Σ ±g. The mean of its outer products is F, because
@@ -36,7 +38,9 @@ def fisher(splats: Splats, cameras: Cameras, *, probes: int = _PROBES, seed: int
     rasterizer, rng = _core.Rasterizer(), np.random.default_rng(seed)
     out = np.zeros((len(splats), 6, 6))
     for i in range(len(cameras)):
-        image, *_ = rasterizer.forward(arrays, view_of(cameras, i, settings), settings, [0.0] * 3, 0)
+        image, *_ = rasterizer.forward(
+            arrays, view_of(cameras, i, settings), settings, [0.0] * 3, 0
+        )
         for _ in range(probes):
             signs = rng.choice(np.array([-1, 1], np.float32), image.shape)
             means, _, log_scales, *_ = rasterizer.backward(arrays, signs)

@@ -41,7 +41,13 @@ class Training:
     """Parameters and optimiser of a run, in coordinates where cameras reach a distance of 1."""
 
     def __init__(
-        self, prior: Splats, targets: Targets, steps: int, *, background: Colour = BLACK, seed: int = 0
+        self,
+        prior: Splats,
+        targets: Targets,
+        steps: int,
+        *,
+        background: Colour = BLACK,
+        seed: int = 0,
     ) -> None:
         torch.manual_seed(seed)
         self.steps, self.seed, self._fill = steps, seed, background
@@ -88,7 +94,9 @@ class Training:
                 now = time.monotonic()
         return self.splats(), spent + time.monotonic() - now
 
-    def rendered(self, view: int, settings: RasterSettings | None = None, **other: Tensor) -> Tensor:
+    def rendered(
+        self, view: int, settings: RasterSettings | None = None, **other: Tensor
+    ) -> Tensor:
         """Render a view, with some tensors replaced by others."""
         how = settings or self._settings
         values = {**self.values, **other}
@@ -110,7 +118,9 @@ class Training:
             optimizer = self._optimizers[name]
             new = old.detach()[rows].requires_grad_()
             moments = optimizer.state.pop(old, {})
-            optimizer.state[new] = {key: m[rows] if m.shape == old.shape else m for key, m in moments.items()}
+            optimizer.state[new] = {
+                key: m[rows] if m.shape == old.shape else m for key, m in moments.items()
+            }
             optimizer.param_groups[0]["params"] = [new]
             self.values[name] = new
 

@@ -69,7 +69,9 @@ class Boxes(Study):
             totals["boxes_ms"] += 1e3 * (time.perf_counter() - between)
             totals["whole_ms"] += 1e3 * (between - begun)
             totals["drawn"] += drawn
-            totals["largest_error"] = max(totals["largest_error"], float(np.abs(canvas.color - image).max()))
+            totals["largest_error"] = max(
+                totals["largest_error"], float(np.abs(canvas.color - image).max())
+            )
         count = len(cameras)
         return [
             {

@@ -109,7 +109,14 @@ class Devices(Study):
             if self.size is not None:
                 options["--size"] = self.size
             flat = [str(part) for option in options.items() for part in option]
-            command = [sys.executable, "-m", "g2ard", "distill", str(place.place / scene.prior), *flat]
+            command = [
+                sys.executable,
+                "-m",
+                "g2ard",
+                "distill",
+                str(place.place / scene.prior),
+                *flat,
+            ]
             usage = measured([*command, "--no-page", "-w"], Path(folder) / "log")
             report = json.loads((out / "report.json").read_text(encoding="utf-8"))
             log = (Path(folder) / "log").read_text(encoding="utf-8", errors="replace")
@@ -155,7 +162,9 @@ def _by_stage(seconds: Mapping[str, float], steps: int) -> Row:
     >>> _by_stage({"train.splat": 0.1, "scan": 0.2, "train.draw": 0.4}, 100)["sort_ms"]
     2.0
     """
-    stage_of = {f"train.{kernel}": stage for stage, kernels in _STAGES.items() for kernel in kernels}
+    stage_of = {
+        f"train.{kernel}": stage for stage, kernels in _STAGES.items() for kernel in kernels
+    }
     row = {f"{stage}_ms": 0.0 for stage in _STAGES}
     for kernel, spent in seconds.items():
         row[f"{stage_of.get(kernel, 'sort')}_ms"] += 1e3 * spent / steps

@@ -93,7 +93,9 @@ class Matched(Study):
         """Return the budgets of a method's cells."""
         if not method.recovers:
             return [Budget("none")]
-        out = [Budget("steps", n) for n in self.steps] + [Budget("seconds", s) for s in self.seconds]
+        out = [Budget("steps", n) for n in self.steps] + [
+            Budget("seconds", s) for s in self.seconds
+        ]
         if self.released and method.released_steps is not None:
             out.append(Budget("released"))
         return out
@@ -137,7 +139,9 @@ class Matched(Study):
         def place(row: Row) -> tuple[Any, ...]:
             return row["scene"], row.get("prior"), row.get("split")
 
-        teachers = {place(row): row["psnr"] for row in rows if row["matched"] == "none" and "psnr" in row}
+        teachers = {
+            place(row): row["psnr"] for row in rows if row["matched"] == "none" and "psnr" in row
+        }
         return [
             {**row, "delta_psnr": row["psnr"] - teachers[place(row)]}
             if "psnr" in row and row["matched"] != "none" and place(row) in teachers
@@ -186,7 +190,9 @@ class Matched(Study):
                 if not (folder / wanted / f"{view}.jpg").exists():
                     save_jpeg(folder / wanted / f"{view}.jpg", np.clip(targets[view], 0, 1))
             views = {"targets": wanted, "views": scored}
-            (folder / pictures / "views.json").write_text(json.dumps(views), encoding="utf-8", newline="\n")
+            (folder / pictures / "views.json").write_text(
+                json.dumps(views), encoding="utf-8", newline="\n"
+            )
             rows.append({**shared, **figures(scored), "split": split, "pictures": pictures})
         return rows
 
@@ -217,7 +223,9 @@ class MatchedWorkspace(Workspace):
         """Return a prior as a .ply."""
         kind = kind or self.kinds[0]
         if kind not in self.kinds:
-            raise InputError(f"scene {self.scene.name}: no {kind} prior (it has {', '.join(self.kinds)})")
+            raise InputError(
+                f"scene {self.scene.name}: no {kind} prior (it has {', '.join(self.kinds)})"
+            )
         if kind != "trained":
             return _Stage(f"{self.key}-{kind}", self.prior_file, Usage(0, 0, 0), {})
         job = {
@@ -279,7 +287,9 @@ class MatchedWorkspace(Workspace):
     def dropped(self) -> int:
         """The number of views that were dropped from training or adaptation because they are scored."""
         adapt = self.adaptation("train") if self.study.adapt_steps else None
-        return super().dropped + (0 if adapt is None else len(adapt) - len(self.read(self.adapted).cameras))
+        return super().dropped + (
+            0 if adapt is None else len(adapt) - len(self.read(self.adapted).cameras)
+        )
 
     @cached_property
     def scored(self) -> dict[str, Cameras]:
@@ -294,7 +304,9 @@ class MatchedWorkspace(Workspace):
         notes, wanted = super().notes(), self.scene.expects.get("adapt")
         if wanted is not None and self.study.adapt_steps:
             found = len(self.read(self.adapted).cameras)
-            notes += [] if found == wanted else [f"adapt: {found:,} views, the paper has {wanted:,}"]
+            notes += (
+                [] if found == wanted else [f"adapt: {found:,} views, the paper has {wanted:,}"]
+            )
         return notes
 
     @cached_property
@@ -307,7 +319,9 @@ class MatchedWorkspace(Workspace):
         """Split → targets to score against."""
         apart = "" if self.study.convention == "gsplat" else f"-{self.study.convention}"
         return {
-            name: StoredTargets(cameras, self._stored(f"targets-{name}{apart}", cameras, self.settings))
+            name: StoredTargets(
+                cameras, self._stored(f"targets-{name}{apart}", cameras, self.settings)
+            )
             for name, cameras in self.scored.items()
         }
 
@@ -317,17 +331,25 @@ class MatchedWorkspace(Workspace):
             store_targets(self.targets(cameras, settings, limit=0), folder)
         return folder
 
-    def reduce(self, source: _Stage, views: Path, job: dict[str, Any], flags: Path | None) -> _Stage:
+    def reduce(
+        self, source: _Stage, views: Path, job: dict[str, Any], flags: Path | None
+    ) -> _Stage:
         """Reduce a scene with the worker's options `job`."""
         if job["method"].startswith("splat-transform"):
             mode = "--decimate-adaptive" if job["method"].endswith("adaptive") else "--decimate"
             given = (str(source.output), mode, str(job["count"]))
             splat_transform()  # check early that it is installed
             return self._run(
-                {"kind": "rival", **job}, source, "out.ply", {}, lambda out: splat_transform(*given, str(out))
+                {"kind": "rival", **job},
+                source,
+                "out.ply",
+                {},
+                lambda out: splat_transform(*given, str(out)),
             )
         files = {"scene": source.output, "views": views, **({"flags": flags} if flags else {})}
-        return self._run({"kind": "reduce", **job, "indoor": self.scene.indoor}, source, "out.ply", files)
+        return self._run(
+            {"kind": "reduce", **job, "indoor": self.scene.indoor}, source, "out.ply", files
+        )
 
     def select(self, source: _Stage, policy: str, k: float, seed: int) -> _Stage:
         """Select training views by the prior."""
@@ -410,7 +432,8 @@ class _Pipeline:
         self.sh_degree = place.study.sh_degree
         if self.sh_degree is None and place.scene.targets != "teacher":
             self.sh_degree = 3
-        self.spent: dict[str, list[tuple[Usage, float]]] = {"reduce": [], "recover": []}  # and wall seconds
+        # and wall seconds
+        self.spent: dict[str, list[tuple[Usage, float]]] = {"reduce": [], "recover": []}
         self.steps = 0
         self.last: dict[str, Any] = {}
 
@@ -441,7 +464,11 @@ class _Pipeline:
         """Return the method's weights of regularisers: the paper's for this kind of prior, or ours."""
         method = self.method
         papers = method.lambdas == "paper"
-        known = {"given": self.place.scene.regularizers}.get(self.prior, self.prior) if papers else "auto"
+        known = (
+            {"given": self.place.scene.regularizers}.get(self.prior, self.prior)
+            if papers
+            else "auto"
+        )
         chosen, _, _ = choose_regularizers(
             known if method.preset == "auto" else method.preset, prior, paper=papers
         )
@@ -452,7 +479,9 @@ class _Pipeline:
         if not self.method.recovers:
             return []
         if self.method.rounds == "paper":
-            return round_counts(self.count, self.budget, fold=self.place.study.fold) or [self.budget]
+            return round_counts(self.count, self.budget, fold=self.place.study.fold) or [
+                self.budget
+            ]
         return pup_rounds(self.count, self.budget) if self.method.rounds == "pup" else [self.budget]
 
     def run(self) -> _Stage:
@@ -491,7 +520,9 @@ class _Pipeline:
         self.spent["reduce"].append((done.usage, done.report.get("seconds", done.usage.wall_s)))
         return done
 
-    def _recover(self, state: _Stage, views: Path, leg: Leg, legs: list[Leg], built: _Stage) -> _Stage:
+    def _recover(
+        self, state: _Stage, views: Path, leg: Leg, legs: list[Leg], built: _Stage
+    ) -> _Stage:
         """Recover; a second recovery at the same count stays anchored to the geometry as `built`."""
         spend = self._spend(leg, legs)
         if spend is None:
@@ -519,7 +550,8 @@ class _Pipeline:
             steps = ROUND_STEPS if own else method.released_steps
             return {"schedule": method.released_schedule, "steps": steps, "seconds": None}
         schedule = method.schedule or self.place.study.schedule
-        before = [] if method.shared_start else legs[: legs.index(leg)]  # the checkpoint is not matched
+        # the checkpoint is not matched
+        before = [] if method.shared_start else legs[: legs.index(leg)]
         if matched.kind == "steps":
             steps = int(leg.share * matched.amount)
             if leg.final:

@@ -15,7 +15,13 @@ from g2ard.stages.recover.anchors import REGULARIZERS
 
 __all__ = ["FINAL_STEPS", "METHODS", "REDUCERS", "ROUND_STEPS", "Budget", "Leg", "MethodSpec"]
 
-REDUCERS = (*get_args(Method), "no-views", "splat-transform", "splat-transform-adaptive", *baselines.METHODS)
+REDUCERS = (
+    *get_args(Method),
+    "no-views",
+    "splat-transform",
+    "splat-transform-adaptive",
+    *baselines.METHODS,
+)
 """Reductions: g2ard's methods, splat-transform, baselines."""
 
 ROUND_STEPS, FINAL_STEPS = 8_000, 30_000

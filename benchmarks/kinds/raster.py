@@ -63,7 +63,9 @@ class Raster(Study):
                         names = {"count": count, "isa": isa, "threads": many, "copies": copies}
                         yield Cell(names, partial(self._measured, place, count, isa, many, copies))
 
-    def _measured(self, place: Workspace, count: int, isa: str, threads: int, copies: int) -> list[Row]:
+    def _measured(
+        self, place: Workspace, count: int, isa: str, threads: int, copies: int
+    ) -> list[Row]:
         before = _core.num_threads()
         try:
             _core.set_num_threads(threads)
@@ -84,7 +86,9 @@ def drawn(splats: Splats, count: int, *, seed: int = 0) -> Splats:
     (25, 2.0, 3)
     """
     if not 1 <= count <= len(splats):
-        raise InputError(f"the scene has {plural(len(splats), 'Gaussian')}, expected at least {count:,}")
+        raise InputError(
+            f"the scene has {plural(len(splats), 'Gaussian')}, expected at least {count:,}"
+        )
     rows = np.sort(np.random.default_rng(seed).permutation(len(splats))[:count])
     taken = splats.take(rows).with_sh_degree(3)
     return replace(taken, scales=taken.scales * np.float32(np.sqrt(len(splats) / count)))
@@ -127,7 +131,9 @@ def timed_step(splats: Splats, cameras: Cameras, isa: str | None, repeats: int) 
     width, height = view[2]
     rendered, *_ = _core.Rasterizer(isa).forward(arrays, view, settings, [0.0, 0.0, 0.0], 0)
     target = np.ascontiguousarray(rendered[::-1])
-    trainer = _core.Trainer(arrays, Photometric(settings, (0.0, 0.0, 0.0), 0.2), splats.scales.max(1), isa)
+    trainer = _core.Trainer(
+        arrays, Photometric(settings, (0.0, 0.0, 0.0), 0.2), splats.scales.max(1), isa
+    )
     still = Rates(*[0.0] * 6)  # rates of 0 keep the scene
     rasterizer = _core.Rasterizer(isa)
     images = timeit.repeat(

@@ -107,7 +107,9 @@ class Recover(Study):
                 and row["count"] == row["budget"]
                 and all(row[name] == other[name] for name in names)
             ]
-            reached = min((r["seconds"] for r in rivals if r["psnr"] >= other["psnr"]), default=None)
+            reached = min(
+                (r["seconds"] for r in rivals if r["psnr"] >= other["psnr"]), default=None
+            )
             share = ["never", "–"]
             if reached is not None:
                 share = [f"{reached:.1f}", f"{reached / other['seconds']:.3f}"]
@@ -145,7 +147,9 @@ class _Workspace(Workspace):
         """Return the start of a count, made once."""
         if budget not in self.starts:
             began = time.monotonic()
-            small = simplify(self.splats, budget, visibility=visibility_source(self.train_cameras)).splats
+            small = simplify(
+                self.splats, budget, visibility=visibility_source(self.train_cameras)
+            ).splats
             if self.sh_degree is not None:
                 small = small.with_sh_degree(self.sh_degree)
             self.starts[budget] = small, time.monotonic() - began
@@ -159,7 +163,9 @@ class _Workspace(Workspace):
         preset = variant.preset or "auto"
         given = {**PRESETS[preset], **variant.settings}
         views = self.train_cameras if self.scene.targets == "photos" else None
-        weights, _, _ = choose_regularizers(given.get("recover.regularizers", "auto"), self.splats, views)
+        weights, _, _ = choose_regularizers(
+            given.get("recover.regularizers", "auto"), self.splats, views
+        )
         values = {
             **variant.settings,
             "recover.engine": self.study.engine,
@@ -238,7 +244,9 @@ class _Run:
             from benchmarks.baselines.thinning import Training
 
             method = GaussianSpa if self.variant.retrains == "gaussianspa" else FastGS
-            training = Training(place.splats, targets, self.steps, background=colour, seed=self.seed)
+            training = Training(
+                place.splats, targets, self.steps, background=colour, seed=self.seed
+            )
             done, seconds = training.run(method(self.budget, self.steps), self._watch)
         self._count_cpu()
         _check_finite(done, [])
@@ -268,7 +276,11 @@ class _Run:
                 self.cpu_began = time.process_time()  # excludes simplification
         self.now = seconds
         self._count_cpu()
-        if step >= _FIRST_LOOK and (step // _FIRST_LOOK).bit_count() == 1 and step % _FIRST_LOOK == 0:
+        if (
+            step >= _FIRST_LOOK
+            and (step // _FIRST_LOOK).bit_count() == 1
+            and step % _FIRST_LOOK == 0
+        ):
             self.found += self._looks(splats(), step, self.before + seconds, 0)
         self.cpu_began = time.process_time()
 

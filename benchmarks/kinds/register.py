@@ -87,7 +87,9 @@ class Register(Study):
                         names = {"ratio": ratio, "matcher": matcher, "start": name, "seed": seed}
                         yield Cell(names, partial(self._measured, site, ratio, matcher, name, seed))
 
-    def _measured(self, site: _Site, ratio: float, matcher: str, start: str, seed: int) -> list[Row]:
+    def _measured(
+        self, site: _Site, ratio: float, matcher: str, start: str, seed: int
+    ) -> list[Row]:
         splats, photos = site.maps(ratio), site.photos
         starts = site.starts_of(start, seed, splats)
         config = RegisterConfig(size=self.size or 1000, matcher=matcher)
@@ -192,7 +194,9 @@ def result_errors(rows: Sequence[PhotoReport], truth: Poses) -> list[PoseError]:
     return [PoseError(*pose_error(pose, truth[name])) for name, pose in poses]
 
 
-def figures(errors: Sequence[PoseError], total: int, metres: float | None) -> dict[str, float | None]:
+def figures(
+    errors: Sequence[PoseError], total: int, metres: float | None
+) -> dict[str, float | None]:
     """Return median position and rotation, worst position, and the shares of all photos within limits.
 
     Positions are in cm if `metres`, the scale of the scene, is known. Photos without a pose count as missed.

@@ -33,7 +33,16 @@ from g2ard.stages.simplify import simplify
 
 __all__ = ["ARMS", "Pool", "Select", "Universe", "pool_of"]
 
-ARMS = ("random", "pose-diverse", "coverage", "directional", "auto", "auto+weights", "pool", "pool+weights")
+ARMS = (
+    "random",
+    "pose-diverse",
+    "coverage",
+    "directional",
+    "auto",
+    "auto+weights",
+    "pool",
+    "pool+weights",
+)
 _CELLS = 50_000
 """Surface cells of coverage and directional, matched to the resolution of a study's small images."""
 _CROWD = 24
@@ -82,7 +91,13 @@ class Select(Study):
                 for arm in self.methods:
                     for percent in (100.0,) if arm.startswith("pool") else self.percents:
                         for draw in range(self.draws if arm == "random" else 1):
-                            names = {"pool": kind, "arm": arm, "percent": percent, "seed": seed, "draw": draw}
+                            names = {
+                                "pool": kind,
+                                "arm": arm,
+                                "percent": percent,
+                                "seed": seed,
+                                "draw": draw,
+                            }
                             trial = partial(self._trial, universe, kind, arm, percent, seed, draw)
                             yield Cell(names, trial, more=self.steps)
 
@@ -170,9 +185,15 @@ class Select(Study):
                 mean = np.mean(list(base.values()), axis=0) if arm == "random" else gains.mean(0)
                 noise = gains.std(0, ddof=1) if len(gains) > 1 else np.full(2, np.nan)
                 figures = [mean[0], noise[0], mean[1], noise[1]]
-                lines.append([scene, pool, f"{percent:g}", arm, *(f"{figure:.2f}" for figure in figures)])
+                lines.append(
+                    [scene, pool, f"{percent:g}", arm, *(f"{figure:.2f}" for figure in figures)]
+                )
         title = "dB over mean random (random: PSNR), ± over pools; in and out of distribution"
-        return (title, ["scene", "pool", "K %", "arm", "in", "±", "out", "±"], lines) if lines else None
+        return (
+            (title, ["scene", "pool", "K %", "arm", "in", "±", "out", "±"], lines)
+            if lines
+            else None
+        )
 
 
 def _both(row: Row) -> NDArray[np.float64]:
@@ -239,7 +260,9 @@ class Universe(Workspace):
             outside = _nearer(self.splats, universe.take(_evenly(rows[4::8], tests)))
         else:
             outside = make_pool(self.splats, tests, kind="orbit", seed=2).resized(size)
-        shown, far = (TeacherRenders(self.splats, views, lazy=True) for views in (universe, outside))
+        shown, far = (
+            TeacherRenders(self.splats, views, lazy=True) for views in (universe, outside)
+        )
         return shown, _evenly(rows[::8], tests), far
 
     def _photos(self) -> tuple[Targets, Rows, Targets]:
@@ -263,7 +286,9 @@ class Universe(Workspace):
         centred = cameras.positions - cameras.positions.mean(0)
         along = np.argsort(centred @ np.linalg.svd(centred, full_matrices=False)[2][0])
         far, rest = along[: len(along) // 8], np.sort(along[len(along) // 8 :])
-        held = np.flatnonzero(words[known][rest] == "test") if stated else np.arange(0, len(rest), 8)
+        held = (
+            np.flatnonzero(words[known][rest] == "test") if stated else np.arange(0, len(rest), 8)
+        )
         return self.targets(cameras.take(rest)), held, self.targets(cameras.take(far))
 
 

@@ -65,7 +65,9 @@ class Simplify(Study):
         scales: multiples of the views' size at which they are scored, with a row each.
     """
 
-    METHODS: ClassVar[Mapping[str, Any]] = {name: name for name in (*REDUCERS, "spark", *_GROWTHS, *_DISTIL)}
+    METHODS: ClassVar[Mapping[str, Any]] = {
+        name: name for name in (*REDUCERS, "spark", *_GROWTHS, *_DISTIL)
+    }
     PROCESSES: ClassVar[bool] = True
 
     protocol: str = key("all", choices=tuple(PROTOCOLS), axis=True)
@@ -87,9 +89,12 @@ class Simplify(Study):
                 names = {"ratio": ratio, "method": method}
                 yield Cell(names, partial(self._measured, place, ratio, method, kinds), kinds)
 
-    def _measured(self, place: Workspace, ratio: float, method: str, kinds: tuple[str, ...]) -> Iterator[Row]:
+    def _measured(
+        self, place: Workspace, ratio: float, method: str, kinds: tuple[str, ...]
+    ) -> Iterator[Row]:
         budget = budget_of(len(place.splats), ratio)
-        ran: dict[bool, tuple[Usage, Splats]] = {}  # methods that run alike for several kinds run once
+        # methods that run alike for several kinds run once
+        ran: dict[bool, tuple[Usage, Splats]] = {}
         for kind in kinds:
             row = {"views_kind": kind, "input_count": len(place.splats), "budget": budget}
             if method.startswith("splat-transform"):
@@ -111,10 +116,14 @@ class Simplify(Study):
     def _run(self, place: Workspace, method: str, budget: int, own: bool) -> tuple[Usage, Splats]:
         with tempfile.TemporaryDirectory(prefix="g2ard-bench-") as folder:
             output = Path(folder) / ("run" if method in _DISTIL else "out.ply")
-            usage = measured(self._command(place, method, budget, output, own), Path(folder) / "log")
+            usage = measured(
+                self._command(place, method, budget, output, own), Path(folder) / "log"
+            )
             return usage, io.read_splats(output / "scene.ply" if method in _DISTIL else output)
 
-    def _command(self, place: Workspace, method: str, budget: int, output: Path, own: bool) -> list[str]:
+    def _command(
+        self, place: Workspace, method: str, budget: int, output: Path, own: bool
+    ) -> list[str]:
         """Return the command as its user types it; `own` means with the views that it makes itself."""
         source, python = str(place.prior_file), [sys.executable, "-m"]
         if method.startswith("splat-transform"):

@@ -61,7 +61,10 @@ def store_targets(targets: Targets, folder: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     for view in range(len(targets.cameras)):
         image = targets[view]
-        np.save(folder / f"{view}.npy", to_bytes(image) if against_of(targets, view) == "photo" else image)
+        np.save(
+            folder / f"{view}.npy",
+            to_bytes(image) if against_of(targets, view) == "photo" else image,
+        )
         mask = mask_of(targets, view)
         if mask is not None:
             np.save(folder / f"{view}.mask.npy", mask)
@@ -88,7 +91,9 @@ def _reduce(job: Job) -> dict[str, Any]:
     constants = {} if job["protection"] is None else {"protection": job["protection"]}
     if job["method"] == "paper":
         constants["retention"] = 1e-9  # one reduction; the cell runs rounds
-    config = SimplifyConfig("default" if job["method"] == "no-views" else job["method"], **constants)
+    config = SimplifyConfig(
+        "default" if job["method"] == "no-views" else job["method"], **constants
+    )
     done = simplify(
         splats,
         job["count"],
@@ -107,7 +112,9 @@ def _select(job: Job) -> dict[str, Any]:
     from benchmarks.policies import order_views
 
     cameras = _cameras(job["views"])
-    order = order_views(io.read_splats(job["scene"]), cameras, job["policy"], seed=job["seed"])[: job["k"]]
+    order = order_views(io.read_splats(job["scene"]), cameras, job["policy"], seed=job["seed"])[
+        : job["k"]
+    ]
     kept = cameras.take(np.sort(order))  # all are training views
     io.write_views(job["output"], kept, splits=["train"] * len(kept), overwrite=True)
     return {"views": len(order)}
@@ -145,7 +152,9 @@ def _recover(job: Job) -> dict[str, Any]:
     done = recover(student, targets, config, anchors=anchors)
     io.write_splats(job["output"], done.splats, overwrite=True)
     report = done.report.as_dict()
-    return {key: report[key] for key in ("steps", "seconds", "psnr", "drift95", "needle", "multiplier")}
+    return {
+        key: report[key] for key in ("steps", "seconds", "psnr", "drift95", "needle", "multiplier")
+    }
 
 
 def _adapt(job: Job) -> dict[str, Any]:
@@ -196,7 +205,9 @@ def _main(path: Path) -> None:
     job: Job = json.loads(path.read_text(encoding="utf-8"))
     try:
         report = _KINDS[job["kind"]](job)
-        with atomic_output(Path(job["output"]).with_name("report.json"), overwrite=True) as temporary:
+        with atomic_output(
+            Path(job["output"]).with_name("report.json"), overwrite=True
+        ) as temporary:
             temporary.write_text(json.dumps(report), encoding="utf-8", newline="\n")
     except (G2ardError, OSError) as error:
         sys.exit(" ".join(str(error).split()))

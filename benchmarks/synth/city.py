@@ -151,7 +151,13 @@ class City:
         return color
 
     def _flat(
-        self, o: Float, d: Float, t: Float, hit: NDArray[np.int64], first: NDArray[np.int64], each: int
+        self,
+        o: Float,
+        d: Float,
+        t: Float,
+        hit: NDArray[np.int64],
+        first: NDArray[np.int64],
+        each: int,
     ) -> NDArray[np.bool_]:
         """Return whether the first and the last of `each` rays from `first` hit the same face."""
         last = first + each - 1
@@ -191,7 +197,9 @@ def city(config: CityConfig | None = None, **options: object) -> City:
     return City(replace(config or CityConfig(), **options))  # type: ignore[arg-type]
 
 
-def _pixel_rays(view: Cameras, row: int, rows: int) -> tuple[NDArray[np.int64], Float, Float, float]:
+def _pixel_rays(
+    view: Cameras, row: int, rows: int
+) -> tuple[NDArray[np.int64], Float, Float, float]:
     """Return rays through 2 × 2 samples per pixel in `rows` rows from `row`, ordered by tile and pixel.
 
     Returns:

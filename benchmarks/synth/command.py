@@ -31,18 +31,24 @@ def _numbers(flag: str, text: str, mark: str, count: int, kind: type) -> tuple[A
     except ValueError:
         values = []
     if len(values) != count:
-        raise typer.BadParameter(f"{flag}: expected {count} numbers with {mark!r} between, got {text!r}")
+        raise typer.BadParameter(
+            f"{flag}: expected {count} numbers with {mark!r} between, got {text!r}"
+        )
     return tuple(values)
 
 
-@command("city", parent=synth, example="python -m benchmarks synth city -o city/ --points 1M --views 120")
+@command(
+    "city", parent=synth, example="python -m benchmarks synth city -o city/ --points 1M --views 120"
+)
 def city(
     run: Run,
     output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Output folder.")],
     points: Annotated[
         Count | None,
         typer.Option(
-            parser=Count.parse_absolute, metavar="COUNT", help="Points of the cloud; 500k by default."
+            parser=Count.parse_absolute,
+            metavar="COUNT",
+            help="Points of the cloud; 500k by default.",
         ),
     ] = None,
     views: Annotated[int, typer.Option(help="Photos in all four splits.")] = 120,
@@ -50,9 +56,13 @@ def city(
     blocks: Annotated[int, typer.Option(help="City blocks per side.")] = 3,
     tile: Annotated[
         float | None,
-        typer.Option(min=1, metavar="METRES", help="Write the cloud as .laz tiles of this side, in cloud/."),
+        typer.Option(
+            min=1, metavar="METRES", help="Write the cloud as .laz tiles of this side, in cloud/."
+        ),
     ] = None,
-    offset: Annotated[str, typer.Option(metavar="X,Y,Z", help="World coordinates of the centre.")] = "0,0,0",
+    offset: Annotated[
+        str, typer.Option(metavar="X,Y,Z", help="World coordinates of the centre.")
+    ] = "0,0,0",
 ) -> None:
     """Generate a city: coloured LiDAR point cloud, photos with exact poses, splits train/val/adapt/ood."""
     from benchmarks.synth import CityConfig, write_city
@@ -71,7 +81,11 @@ def city(
         )
     except InputError as error:
         raise typer.BadParameter(str(error)) from None
-    how: dict[str, Any] = {"overwrite": run.overwrite, "threads": run.threads, "progress": run.progress}
+    how: dict[str, Any] = {
+        "overwrite": run.overwrite,
+        "threads": run.threads,
+        "progress": run.progress,
+    }
     manifest = write_city(output, config, tile=tile, **how)
     splits = ", ".join(f"{count} {name}" for name, count in manifest["views"].items())
     run.say(f"{output}: {plural(config.points, 'point')}, {splits} views of {width}×{height}")

@@ -51,7 +51,8 @@ class Material(IntEnum):
     """Materials of primitives, with a function each in `paint`."""
 
     GROUND = 0
-    BLOCK = 1  # pavement round a lot: parameter 0 is 1 for grass within, 1 is 1 where paths cross it
+    # pavement round a lot: parameter 0 is 1 for grass within, 1 is 1 where paths cross it
+    BLOCK = 1
     FACADE = 2  # window pitch, storey height, window width and height as shares, brick
     TILES = 3
     LEAVES = 4
@@ -135,7 +136,9 @@ def _tree(b: _Builder, rng: Generator, x: float, y: float, foot: float) -> None:
     size = 0.75 + 0.6 * rng.random()
     green = np.array([0.33, 0.41, 0.21]) + (rng.random(3) - 0.5) * [0.16, 0.10, 0.08]
     trunk = 2.2 * size
-    b.around(Kind.CYLINDER, (x, y, foot), (0.16 * size, 0.16 * size, trunk + size), (0.33, 0.24, 0.17))
+    b.around(
+        Kind.CYLINDER, (x, y, foot), (0.16 * size, 0.16 * size, trunk + size), (0.33, 0.24, 0.17)
+    )
     if rng.random() < 0.2:
         for k in range(3):
             r = (1.7 - 0.45 * k) * size
@@ -147,8 +150,14 @@ def _tree(b: _Builder, rng: Generator, x: float, y: float, foot: float) -> None:
         out = 0.0 if k == 5 else (0.8 + 0.5 * rng.random()) * size
         r = (1.5 if k == 5 else 0.9 + 0.4 * rng.random()) * size
         tall = r * (1.7 if k == 5 else 1.4 + 0.4 * rng.random())
-        at = (x + out * np.cos(turn), y + out * np.sin(turn), foot + trunk * (0.8 + 0.4 * rng.random()))
-        b.around(Kind.ELLIPSOID, at, (r, r, tall), green * (0.9 + 0.2 * rng.random()), Material.LEAVES)
+        at = (
+            x + out * np.cos(turn),
+            y + out * np.sin(turn),
+            foot + trunk * (0.8 + 0.4 * rng.random()),
+        )
+        b.around(
+            Kind.ELLIPSOID, at, (r, r, tall), green * (0.9 + 0.2 * rng.random()), Material.LEAVES
+        )
 
 
 def _lamp(b: _Builder, x: float, y: float, towards: Float) -> None:
@@ -175,7 +184,12 @@ def _car(b: _Builder, rng: Generator, x: float, y: float, along: int) -> None:
 
 def _building(b: _Builder, rng: Generator, lo: Float, hi: Float, storeys: int, gable: bool) -> None:
     storey = 2.9 + 0.6 * rng.random()
-    windows = (2.4 + 1.6 * rng.random(), storey, 0.35 + 0.3 * rng.random(), 0.45 + 0.2 * rng.random())
+    windows = (
+        2.4 + 1.6 * rng.random(),
+        storey,
+        0.35 + 0.3 * rng.random(),
+        0.45 + 0.2 * rng.random(),
+    )
     wall = _pick(rng, _WALLS)
     brick = 1.0 if rng.random() < 0.45 else 0.0
     top = CURB + storeys * storey + (0.25 if gable else 0.8)
@@ -185,13 +199,19 @@ def _building(b: _Builder, rng: Generator, lo: Float, hi: Float, storeys: int, g
         along_x = half[0] > half[1]
         kind, rise = (Kind.GABLE_X, half[1]) if along_x else (Kind.GABLE_Y, half[0])
         eaves = half + 0.35
-        b.around(kind, (*middle, top - 0.2), (*eaves, rise * 0.85), _pick(rng, _ROOFS), Material.TILES)
-        b.around(Kind.BOX, (*(middle + half * 0.4), top), (0.35, 0.35, rise * 0.9), (0.50, 0.32, 0.26))
+        b.around(
+            kind, (*middle, top - 0.2), (*eaves, rise * 0.85), _pick(rng, _ROOFS), Material.TILES
+        )
+        b.around(
+            Kind.BOX, (*(middle + half * 0.4), top), (0.35, 0.35, rise * 0.9), (0.50, 0.32, 0.26)
+        )
         return
     for _ in range(1 + int(rng.random() * 3)):  # lifts, vents, plant rooms
         at = middle + (rng.random(2) - 0.5) * half
         size = 0.6 + 1.2 * rng.random(2)
-        b.around(Kind.BOX, (*at, top), (*size, 0.8 + 1.6 * rng.random()), _pick(rng, [(0.6, 0.6, 0.6)]))
+        b.around(
+            Kind.BOX, (*at, top), (*size, 0.8 + 1.6 * rng.random()), _pick(rng, [(0.6, 0.6, 0.6)])
+        )
 
 
 def _houses(b: _Builder, rng: Generator, lo: Float, hi: Float) -> None:
@@ -220,7 +240,9 @@ def _perimeter(b: _Builder, rng: Generator, lo: Float, hi: Float) -> None:
             back = depth - 2.0 * rng.random()
             y0, y1 = (y, y + back) if row == 0 else (y + depth - back, y + depth)
             storeys = 2 + int(rng.random() * 5)
-            _building(b, rng, np.array([x, y0]), np.array([x + width, y1]), storeys, rng.random() < 0.35)
+            _building(
+                b, rng, np.array([x, y0]), np.array([x + width, y1]), storeys, rng.random() < 0.35
+            )
             x += width
     for _ in range(9):
         x, y = lo + [3, depth + 2.5] + rng.random(2) * (hi - lo - [6, 2 * depth + 5])
@@ -238,11 +260,19 @@ def _tower(b: _Builder, rng: Generator, lo: Float, hi: Float) -> None:
     windows = (2.0 + rng.random(), storey, 0.72, 0.62, 0.0)
     top = roof + storeys * storey + 0.8
     b.add(
-        Kind.BOX, (*corner, roof - 0.1), (*opposite, top), _pick(rng, _WALLS[2:6]), Material.FACADE, windows
+        Kind.BOX,
+        (*corner, roof - 0.1),
+        (*opposite, top),
+        _pick(rng, _WALLS[2:6]),
+        Material.FACADE,
+        windows,
     )
     b.around(Kind.BOX, (*middle, top), (3.0, 2.4, 2.6), (0.6, 0.6, 0.6))
     b.around(
-        Kind.CYLINDER, (middle[0] + 1.5, middle[1] + 0.5, top + 2.6), (0.08, 0.08, 5.0), (0.75, 0.2, 0.15)
+        Kind.CYLINDER,
+        (middle[0] + 1.5, middle[1] + 0.5, top + 2.6),
+        (0.08, 0.08, 5.0),
+        (0.75, 0.2, 0.15),
     )
     for x in np.arange(lo[0] + 2.5, hi[0] - 2, 6.0):
         for y in (lo[1] + 2.2, hi[1] - 2.2):
@@ -269,7 +299,11 @@ def _furnish(b: _Builder, rng: Generator, lo: Float, hi: Float) -> None:
         for edge, inwards in ((lo[1 - axis], 1.0), (hi[1 - axis], -1.0)):
 
             def place(
-                s: float, inset: float, axis: int = axis, edge: float = edge, inwards: float = inwards
+                s: float,
+                inset: float,
+                axis: int = axis,
+                edge: float = edge,
+                inwards: float = inwards,
             ) -> tuple[float, float]:
                 across = edge + inwards * inset
                 return (s, across) if axis == 0 else (across, s)
@@ -296,7 +330,9 @@ def _outskirts(b: _Builder, rng: Generator, reach: Float) -> None:
         elif outside > 9.5 and (np.abs(at) - reach).min() < -8:
             half = np.array([4.5, 4.0]) + rng.random(2)
             away = np.where(np.abs(at) - reach > 0, np.sign(at) * half, 0.0)
-            _building(b, rng, at + away - half, at + away + half, 1 + int(rng.random() * 2), gable=True)
+            _building(
+                b, rng, at + away - half, at + away + half, 1 + int(rng.random() * 2), gable=True
+            )
 
 
 def plan(blocks: int, seed: int) -> Layout:

@@ -50,7 +50,10 @@ class Returns:
 
     def take(self, index: NDArray[np.int64]) -> Returns:
         return Returns(
-            self.origins[:, index], self.directions[:, index], self.ranges[index], self.primitives[index]
+            self.origins[:, index],
+            self.directions[:, index],
+            self.ranges[index],
+            self.primitives[index],
         )
 
 
@@ -98,7 +101,9 @@ def _fire(layout: Layout, rng: Generator, stations: Float, rays: int, aerial: bo
         far = np.inf if aerial else _STREET_RANGE
         t, hit = _cast_in_patches(layout, origin, d, far)
         found = np.flatnonzero(hit >= 0)
-        parts.append(Returns(np.broadcast_to(origin, (3, len(found))), d[:, found], t[found], hit[found]))
+        parts.append(
+            Returns(np.broadcast_to(origin, (3, len(found))), d[:, found], t[found], hit[found])
+        )
     return Returns(
         np.concatenate([p.origins for p in parts], 1),
         np.concatenate([p.directions for p in parts], 1),
@@ -107,7 +112,9 @@ def _fire(layout: Layout, rng: Generator, stations: Float, rays: int, aerial: bo
     )
 
 
-def _cast_in_patches(layout: Layout, origin: Float, d: Float, far: float) -> tuple[Float, NDArray[np.int64]]:
+def _cast_in_patches(
+    layout: Layout, origin: Float, d: Float, far: float
+) -> tuple[Float, NDArray[np.int64]]:
     """Return the first hits of rays sorted by azimuth, cast in packets narrow in azimuth and elevation.
 
     A packet tests all primitives that its bounds may hit; a single ray into the sky prevents early stops.
@@ -115,7 +122,9 @@ def _cast_in_patches(layout: Layout, origin: Float, d: Float, far: float) -> tup
     n = d.shape[1]
     packet = int(np.clip(n // 40, *_PACKET))
     sector = packet * max(1, round(float(np.sqrt(n / packet / _SQUARE))))
-    order = np.concatenate([i + np.argsort(d[2, i : i + sector], kind="stable") for i in range(0, n, sector)])
+    order = np.concatenate(
+        [i + np.argsort(d[2, i : i + sector], kind="stable") for i in range(0, n, sector)]
+    )
     t, hit = np.empty(n), np.empty(n, np.int64)
     t[order], hit[order] = cast(layout.shapes, origin, d[:, order], far=far, packet=packet)
     return t, hit

@@ -29,7 +29,9 @@ def hash01(*keys: Array | int) -> Array:
     return np.multiply(h >> np.uint32(8), np.float32(2**-24), dtype=np.float32)
 
 
-def band(x: Array, lo: Array | float, hi: Array | float, width: Array, period: float = 1.0) -> Array:
+def band(
+    x: Array, lo: Array | float, hi: Array | float, width: Array, period: float = 1.0
+) -> Array:
     """Return the share of [x − width/2, x + width/2] in [lo, hi), repeated every `period`."""
 
     def integral(at: Array) -> Array:

@@ -65,7 +65,9 @@ class _Shadows:
         self._east /= np.linalg.norm(self._east)
         self._north = np.cross(SUN, self._east)
         lo, hi = layout.shapes.lo.min(0), layout.shapes.hi.max(0)
-        corners = np.array([[x, y, z] for x in (lo[0], hi[0]) for y in (lo[1], hi[1]) for z in (0, hi[2])])
+        corners = np.array(
+            [[x, y, z] for x in (lo[0], hi[0]) for y in (lo[1], hi[1]) for z in (0, hi[2])]
+        )
         a, b = corners @ self._east, corners @ self._north
         self._start = np.array([a.min(), b.min()])
         span = np.array([np.ptp(a), np.ptp(b)])
@@ -90,9 +92,9 @@ class _Shadows:
                     + self._high * SUN[:, None, None]
                 ).reshape(3, -1)
                 t, _ = cast(layout.shapes, at, np.broadcast_to(-SUN[:, None], at.shape))
-                depth[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1] = (self._high - t).reshape(
-                    len(rows), -1
-                )
+                depth[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1] = (
+                    self._high - t
+                ).reshape(len(rows), -1)
         return depth
 
     def lit(self, p: Float, facing: Array) -> Array:
@@ -149,7 +151,9 @@ class Painter:
         facing = np.maximum(SUN @ normal, 0.0).astype(np.float32)
         sun = facing * self._shadows.lit(p + 0.02 * normal, facing)
         # Ambient light from the sky and the ground, less near the ground.
-        open_ = (0.72 + 0.28 * normal[2] + 0.12 * np.minimum(p[2] / 6, 1.0) - 0.06).astype(np.float32)
+        open_ = (0.72 + 0.28 * normal[2] + 0.12 * np.minimum(p[2] / 6, 1.0) - 0.06).astype(
+            np.float32
+        )
         light = _SUNLIGHT[:, None] * sun + _SKYLIGHT[:, None] * open_
         return np.clip(albedo * light * 1.12, 0.0, 1.0)
 
@@ -187,7 +191,9 @@ class Painter:
         wide = np.maximum(s.wu, s.wv)
         out: Array = np.ones_like(wide)
         for wavelength, amplitude in octaves:
-            out = out + np.float32(amplitude) * self._noise(s.u + shift, s.v - shift, wavelength, wide)
+            out = out + np.float32(amplitude) * self._noise(
+                s.u + shift, s.v - shift, wavelength, wide
+            )
         return out
 
     def _grass(self, s: _Spots) -> Array:
@@ -223,9 +229,13 @@ class Painter:
         return at - first - k * pitch
 
     @staticmethod
-    def _markings(across: Array, along: Array, w_across: Array, w_along: Array, crossing: Array) -> Array:
+    def _markings(
+        across: Array, along: Array, w_across: Array, w_along: Array, crossing: Array
+    ) -> Array:
         """Return the coverage by white paint: dashed centre line, edge lines, zebra crossings."""
-        line = band(np.abs(across), -0.08, 0.08, w_across, 1e3) * band(along, 0.0, 3.0, w_along, 7.5)
+        line = band(np.abs(across), -0.08, 0.08, w_across, 1e3) * band(
+            along, 0.0, 3.0, w_along, 7.5
+        )
         edge = band(np.abs(across), 3.0, 3.12, w_across, 1e3)
         to_crossing = np.abs(crossing)
         zebra = band(to_crossing, ROAD + 1.0, ROAD + 4.0, w_along, 1e3) * band(
@@ -233,12 +243,16 @@ class Painter:
         )
         stop = band(to_crossing, ROAD + 4.8, ROAD + 5.2, w_along, 1e3) * (np.abs(across) < 3.0)
         free = ramp(to_crossing, ROAD + 5.2, w_along)
-        return np.maximum(np.maximum(line, edge) * free, np.maximum(zebra * (np.abs(across) < 4.6), stop))
+        return np.maximum(
+            np.maximum(line, edge) * free, np.maximum(zebra * (np.abs(across) < 4.6), stop)
+        )
 
     def _block(self, s: _Spots) -> Array:
         """Paint paving slabs around the lot, a curb, and grass or a yard inside."""
         wide = np.maximum(s.wu, s.wv)
-        joint = 1 - 0.28 * np.maximum(band(s.u, 0.0, 0.025, s.wu, 0.6), band(s.v, 0.0, 0.025, s.wv, 0.6))
+        joint = 1 - 0.28 * np.maximum(
+            band(s.u, 0.0, 0.025, s.wu, 0.6), band(s.v, 0.0, 0.025, s.wv, 0.6)
+        )
         slab = _tones(s, s.u, s.v, (0.6, 0.6), 0.14)
         paving = s.colour * (self._grain(s, (0.05, 0.08), (1.2, 0.07), (9.0, 0.05)) + slab) * joint
         edge = _to_edge(s)
@@ -246,9 +260,12 @@ class Painter:
         within = ramp(edge, 2.9, wide) * s.parameters[0]
         middle = (s.lo + s.hi) / 2
         path = np.maximum(
-            1 - ramp(np.abs(s.p[0] - middle[0]), 1.8, s.wu), 1 - ramp(np.abs(s.p[1] - middle[1]), 1.8, s.wv)
+            1 - ramp(np.abs(s.p[0] - middle[0]), 1.8, s.wu),
+            1 - ramp(np.abs(s.p[1] - middle[1]), 1.8, s.wv),
         )
-        gravel = np.array([0.66, 0.58, 0.46], np.float32)[:, None] * self._grain(s, (0.06, 0.2), (0.8, 0.08))
+        gravel = np.array([0.66, 0.58, 0.46], np.float32)[:, None] * self._grain(
+            s, (0.06, 0.2), (0.8, 0.08)
+        )
         green = _mix(self._grass(s), gravel, path * s.parameters[1])
         return _mix(paving, green, within)
 
@@ -265,7 +282,9 @@ class Painter:
 
     def _flat_roof(self, s: _Spots) -> Array:
         edge = _to_edge(s)
-        gravel = np.tile(np.float32(0.46) * self._grain(s, (0.15, 0.2), (1.0, 0.12), (6.0, 0.12)), (3, 1))
+        gravel = np.tile(
+            np.float32(0.46) * self._grain(s, (0.15, 0.2), (1.0, 0.12), (6.0, 0.12)), (3, 1)
+        )
         return _mix(gravel, s.colour * np.float32(0.9), 1 - ramp(edge, 0.4, s.wu))
 
     def _windows(self, s: _Spots, wall: Array) -> Array:
@@ -282,15 +301,27 @@ class Painter:
         inside = ((u > 0) & (u < columns) & (v < floors)).astype(np.float32)
         column, floor = np.floor(u), np.floor(v)
         shop = (floor == 0) & (s.lo[2] < 1) & (hash01(s.primitive, 5) < 0.5) & (floors > 2)
-        lo_u, hi_u = np.where(shop, 0.06, 0.5 - share_u / 2), np.where(shop, 0.94, 0.5 + share_u / 2)
-        lo_v, hi_v = np.where(shop, 0.12, 0.52 - share_v / 2), np.where(shop, 0.74, 0.52 + share_v / 2)
+        lo_u, hi_u = (
+            np.where(shop, 0.06, 0.5 - share_u / 2),
+            np.where(shop, 0.94, 0.5 + share_u / 2),
+        )
+        lo_v, hi_v = (
+            np.where(shop, 0.12, 0.52 - share_v / 2),
+            np.where(shop, 0.74, 0.52 + share_v / 2),
+        )
         rim_u, rim_v = 0.09 * scale, 0.09 / storey
-        frame = band(u, lo_u - rim_u, hi_u + rim_u, wu) * band(v, lo_v - rim_v, hi_v + rim_v, wv) * inside
+        frame = (
+            band(u, lo_u - rim_u, hi_u + rim_u, wu)
+            * band(v, lo_v - rim_v, hi_v + rim_v, wv)
+            * inside
+        )
         pane = band(u, lo_u, hi_u, wu) * band(v, lo_v, hi_v, wv) * inside
         cross = band(u, 0.5 - rim_u / 3, 0.5 + rim_u / 3, wu) * pane
         tone = hash01(column, floor, s.primitive)
         glass = np.stack([0.10 + 0.16 * tone, 0.14 + 0.17 * tone, 0.20 + 0.17 * tone])
-        blind = (hash01(column, floor, s.primitive, 3) < 0.25) * ramp(v - floor, lo_v + 0.3 * share_v, wv)
+        blind = (hash01(column, floor, s.primitive, 3) < 0.25) * ramp(
+            v - floor, lo_v + 0.3 * share_v, wv
+        )
         glass = _mix(glass, (0.72, 0.68, 0.58), blind * 0.8)
         trim = 0.25 * wall + np.array([0.68, 0.66, 0.63], np.float32)[:, None]
         out = _mix(wall, trim, frame)
@@ -298,7 +329,9 @@ class Painter:
         out = _mix(out, trim, cross * np.float32(0.9))
         course = band(v, 0.0, 0.05, wv) * (floor >= 1) * (floor < floors + 1)
         out = _mix(out, trim * np.float32(0.85), course * (1 - frame) * 0.7)
-        awning = np.stack([hash01(s.primitive, k) * np.float32(0.6) + np.float32(0.15) for k in (11, 12, 13)])
+        awning = np.stack(
+            [hash01(s.primitive, k) * np.float32(0.6) + np.float32(0.15) for k in (11, 12, 13)]
+        )
         return _mix(out, awning, band(v, 0.78, 0.97, wv, 1e3) * shop * inside)
 
     def _tiles(self, s: _Spots) -> Array:
@@ -306,7 +339,9 @@ class Painter:
         column = band(s.u + 0.15 * (np.floor(s.v / np.float32(0.24)) % 2), 0.0, 0.03, s.wu, 0.3)
         tone = _tones(s, s.u, s.v, (0.3, 0.24), 0.3)
         return (
-            s.colour * (self._grain(s, (0.8, 0.08), (4.0, 0.1)) + tone) * (1 - 0.4 * np.maximum(row, column))
+            s.colour
+            * (self._grain(s, (0.8, 0.08), (4.0, 0.1)) + tone)
+            * (1 - 0.4 * np.maximum(row, column))
         )
 
     def _leaves(self, s: _Spots) -> Array:

@@ -11,7 +11,11 @@ __all__ = ["ring_scan"]
 
 _ROOM = (10.0, 7.0, 3.0)
 _STATIONS = ((2.5, 2.0, 1.6), (7.0, 4.5, 1.6))
-_FURNITURE = (((4, 3, 0), (5.2, 3.8, 0.9)), ((8.5, 0.3, 0), (9.7, 1.2, 2.1)), ((1, 5.5, 0), (3, 6.5, 0.5)))
+_FURNITURE = (
+    ((4, 3, 0), (5.2, 3.8, 0.9)),
+    ((8.5, 0.3, 0), (9.7, 1.2, 2.1)),
+    ((1, 5.5, 0), (3, 6.5, 0.5)),
+)
 _ELEVATIONS = (-40.0, 25.0)
 _NOISE = 0.01
 
@@ -33,7 +37,9 @@ def ring_scan(rings: int = 48, turns: int = 1200) -> Points:
     up = np.radians(np.linspace(*_ELEVATIONS, rings))[:, None]
     around = np.arange(turns) * 2 * np.pi / turns
     flat = np.cos(up)
-    rays = np.stack([flat * np.cos(around), flat * np.sin(around), np.sin(up) + 0 * around]).reshape(3, -1)
+    rays = np.stack(
+        [flat * np.cos(around), flat * np.sin(around), np.sin(up) + 0 * around]
+    ).reshape(3, -1)
     lo, hi = np.array(_FURNITURE, np.float64).swapaxes(0, 1)
     things = Shapes(np.full(len(lo), Kind.BOX), lo, hi)
     room = Shapes(np.full(1, Kind.BOX), np.zeros((1, 3)), np.array([_ROOM]))

@@ -156,7 +156,9 @@ _SPANS: dict[int, Callable[[Float, Float], Spans]] = {
 }
 
 
-def _faces(q: Float, residuals: Sequence[Float], normals: Sequence[Sequence[Float | float]]) -> Float:
+def _faces(
+    q: Float, residuals: Sequence[Float], normals: Sequence[Sequence[Float | float]]
+) -> Float:
     """The normal of the face whose residual is largest, that is: which the point lies on."""
     face = np.argmax(np.stack(residuals), axis=0)
     out = np.zeros_like(q)

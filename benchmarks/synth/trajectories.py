@@ -29,7 +29,10 @@ def split_counts(views: int) -> dict[str, int]:
     >>> split_counts(40)
     {'train': 28, 'val': 4, 'adapt': 3, 'ood': 5}
     """
-    rest = {name: max(1, round(views * share)) for name, share in zip(SPLITS[1:], _SHARES[1:], strict=True)}
+    rest = {
+        name: max(1, round(views * share))
+        for name, share in zip(SPLITS[1:], _SHARES[1:], strict=True)
+    }
     return {"train": views - sum(rest.values()), **rest}
 
 
@@ -76,7 +79,9 @@ def _inwards(layout: Layout, at: Float, heading: float, yaw: float) -> float:
     return heading - yaw if leaving else heading + yaw
 
 
-def _street(layout: Layout, count: int, parity: int, lane: float, height: float, pitch: float) -> list[Float]:
+def _street(
+    layout: Layout, count: int, parity: int, lane: float, height: float, pitch: float
+) -> list[Float]:
     at, heading = _along(_drives(layout, parity, lane), count)
     return [
         _pose(
@@ -101,7 +106,8 @@ def _lawnmower(layout: Layout, count: int, height: float, pitch: float, axis: in
         path.append((a, b))
     at, heading = _along(path, count)
     return [
-        _pose(np.array([*at[i], height]), heading[i] + 90.0 * (i % 4) + 20.0, pitch) for i in range(count)
+        _pose(np.array([*at[i], height]), heading[i] + 90.0 * (i % 4) + 20.0, pitch)
+        for i in range(count)
     ]
 
 
@@ -125,7 +131,9 @@ def _circle(layout: Layout, count: int) -> list[Float]:
     radius = layout.reach + 0.6 * min(PITCH)
     height = 55.0 + 0.12 * layout.reach.max()
     return [
-        look_at([radius[0] * np.cos(a), radius[1] * np.sin(a), height], [8 * np.sin(3 * a), 0.0, 5.0])
+        look_at(
+            [radius[0] * np.cos(a), radius[1] * np.sin(a), height], [8 * np.sin(3 * a), 0.0, 5.0]
+        )
         for a in turn
     ]
 
@@ -146,7 +154,9 @@ def trajectories(layout: Layout, views: int, size: tuple[int, int]) -> dict[str,
     counts = split_counts(views)
     both = counts["train"] + counts["val"]
     aerial = both * 2 // 5
-    pool = _street(layout, both - aerial, 1, _LANE, 2.3, 4.0) + _lawnmower(layout, aerial, 62.0, -48.0, 0)
+    pool = _street(layout, both - aerial, 1, _LANE, 2.3, 4.0) + _lawnmower(
+        layout, aerial, 62.0, -48.0, 0
+    )
     held = np.floor((np.arange(counts["val"]) + 0.5) * both / counts["val"]).astype(int)
     adapt_aerial = counts["adapt"] // 3
     poses = {
@@ -154,7 +164,8 @@ def trajectories(layout: Layout, views: int, size: tuple[int, int]) -> dict[str,
         "val": [pool[i] for i in held],
         "adapt": _street(layout, counts["adapt"] - adapt_aerial, 0, 1.2, 1.8, 7.0)
         + _lawnmower(layout, adapt_aerial, 75.0, -35.0, 1),
-        "ood": _drone(layout, counts["ood"] - counts["ood"] // 2) + _circle(layout, counts["ood"] // 2),
+        "ood": _drone(layout, counts["ood"] - counts["ood"] // 2)
+        + _circle(layout, counts["ood"] // 2),
     }
     width, height = size
     focal = width / 2 / np.tan(np.deg2rad(_FOV) / 2)

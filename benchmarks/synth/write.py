@@ -80,7 +80,9 @@ def _scanned(town: City, progress: Progress) -> Iterator[Points]:
         progress("cloud", done, count)
 
 
-def _write_tiles(folder: Path, parts: Iterator[Points], offset: NDArray[np.float64], side: float) -> None:
+def _write_tiles(
+    folder: Path, parts: Iterator[Points], offset: NDArray[np.float64], side: float
+) -> None:
     """Write points as .laz files, one per square, named by its column and row from the centre."""
     import laspy
 
@@ -113,7 +115,9 @@ def _photograph(town: City, place: Path, threads: int, progress: Progress) -> No
 
     pool = ThreadPoolExecutor(threads or os.cpu_count() or 1)
     try:
-        for done, future in enumerate(as_completed([pool.submit(shoot, *job) for job in jobs]), start=1):
+        for done, future in enumerate(
+            as_completed([pool.submit(shoot, *job) for job in jobs]), start=1
+        ):
             future.result()
             progress("photos", done, len(jobs))
     finally:

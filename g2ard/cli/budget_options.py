@@ -52,7 +52,9 @@ class Count:
                 raise typer.BadParameter(f"expected at most 100%, got {text!r}")
             return cls(number / 100, text)
         if not unit and "." in match[1]:
-            raise typer.BadParameter(f"expected a whole number, or a share such as 25%, got {text!r}")
+            raise typer.BadParameter(
+                f"expected a whole number, or a share such as 25%, got {text!r}"
+            )
         number *= {"": 1, "k": 1_000, "m": 1_000_000}[unit]
         if number != round(number):
             raise typer.BadParameter(f"expected a whole number, got {text!r}")
@@ -101,7 +103,9 @@ class Counts(tuple[Count, ...]):
         if _GROUPED.fullmatch(text.strip()) and any(group.startswith("0") for group in groups[1:]):
             return cls([Count.parse(text)])
         if any(re.fullmatch(r"0\d\d", group.strip()) for group in groups[1:]):
-            raise typer.BadParameter(f"commas separate counts: write 5_000,4_000 or 5k,4k, not {text!r}")
+            raise typer.BadParameter(
+                f"commas separate counts: write 5_000,4_000 or 5k,4k, not {text!r}"
+            )
         return cls(Count.parse(part) for part in groups)
 
 
@@ -150,7 +154,9 @@ BUDGETS: Options = {
     ),
     "min_psnr": (
         float,
-        typer.Option(min=1, help="Smallest scene with at least this PSNR against the original, dB."),
+        typer.Option(
+            min=1, help="Smallest scene with at least this PSNR against the original, dB."
+        ),
     ),
     "min_ssim": (
         float,
@@ -180,7 +186,9 @@ TILES: Options = {
     ),
     "workers": (
         int,
-        typer.Option(min=1, help="Processes for tiles; by default as many as cores and memory allow."),
+        typer.Option(
+            min=1, help="Processes for tiles; by default as many as cores and memory allow."
+        ),
     ),
     "scheduler": (
         str,

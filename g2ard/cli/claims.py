@@ -32,12 +32,14 @@ class Claims:
     def __init__(self, given: Iterable[Any], written: Collection[Any], overwrite: bool) -> None:
         self.overwrite = overwrite
         self._inputs: list[Path] = []
-        outputs = set(map(id, written))  # by identity: an output may equal an input, which is refused later
+        # by identity: an output may equal an input, which is refused later
+        outputs = set(map(id, written))
         for value in given:
             for path in value if isinstance(value, list) else [value]:
                 if isinstance(path, Path) and id(path) not in outputs:
                     self._inputs.append(path)
-        self._outputs: dict[Path, tuple[str, bool]] = {}  # real path → option, whether all below is its own
+        # real path → option, whether all below is its own
+        self._outputs: dict[Path, tuple[str, bool]] = {}
 
     def claim(self, flag: str, *outputs: Path, folder: bool = False) -> None:
         """Record what an option writes, before any work.

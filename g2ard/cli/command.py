@@ -66,7 +66,9 @@ _COMMON_OPTIONS: Options = {
     ),
     "config": (
         Path,
-        typer.Option(metavar="FILE.toml", callback=load_config, is_eager=True, help="Read default options."),
+        typer.Option(
+            metavar="FILE.toml", callback=load_config, is_eager=True, help="Read default options."
+        ),
     ),
 }
 """Options of all commands."""
@@ -83,7 +85,9 @@ _SETTINGS: Options = {
 _SCENE_OPTIONS: Options = {
     "render_model": (
         RenderModel,
-        typer.Option(help="How the scenes are drawn, if their files do not say it or say it wrongly."),
+        typer.Option(
+            help="How the scenes are drawn, if their files do not say it or say it wrongly."
+        ),
     )
 }
 
@@ -92,7 +96,8 @@ _POINT_OPTIONS: Options = {
     "box": (
         str,
         typer.Option(
-            metavar="X,Y,Z,X,Y,Z", help="Of a point cloud, keep points between two corners, in its units."
+            metavar="X,Y,Z,X,Y,Z",
+            help="Of a point cloud, keep points between two corners, in its units.",
         ),
     ),
     "where": (
@@ -184,7 +189,9 @@ def command(
 
         # Typer reads options from the signature: the context, the command's own, and the shared ones.
         context = inspect.Parameter("ctx", inspect.Parameter.KEYWORD_ONLY, annotation=typer.Context)
-        parameters = [p.replace(kind=inspect.Parameter.KEYWORD_ONLY) for p in (context, *all_parameters)]
+        parameters = [
+            p.replace(kind=inspect.Parameter.KEYWORD_ONLY) for p in (context, *all_parameters)
+        ]
         call.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
         call.__annotations__ = {p.name: p.annotation for p in parameters}
         call.__doc__ = fn.__doc__
@@ -199,7 +206,9 @@ def _create_parameter(name: str, kind: Any, option: Any, default: Any = None) ->
     if default is None:
         kind = kind | None
     annotation = Annotated[kind, option]
-    return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
+    return inspect.Parameter(
+        name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation
+    )
 
 
 def _execute(run: Run, fn: Callable[..., None], options: Named) -> None:

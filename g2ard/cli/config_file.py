@@ -33,7 +33,9 @@ def load_config(ctx: typer.Context, path: Path | None) -> Path | None:
         return None
     values = _read_toml(path)
     name = str(ctx.info_name)
-    tables = {key: value for key, value in values.items() if isinstance(value, dict) and key != "set"}
+    tables = {
+        key: value for key, value in values.items() if isinstance(value, dict) and key != "set"
+    }
     top = {key: value for key, value in values.items() if key not in tables}
     commands = _find_parameters(ctx, path, tables)
     for other, table in tables.items():
@@ -78,7 +80,9 @@ def _find_parameters(ctx: typer.Context, path: Path, tables: Iterable[str]) -> d
     name = str(ctx.info_name)
     others = set(tables) - {name}
     if strange := others - {*COMMANDS}:
-        raise typer.BadParameter(f"{path}: unknown command {suggest_names(strange, {*COMMANDS, name})}")
+        raise typer.BadParameter(
+            f"{path}: unknown command {suggest_names(strange, {*COMMANDS, name})}"
+        )
     for other in others:
         register_commands(other)
     commands: Named = getattr(typer.main.get_command(app), "commands", {}) if others else {}
@@ -130,7 +134,9 @@ def _flatten(table: Any, prefix: str = "") -> Named:
         )
     out: Named = {}
     for key, value in table.items():
-        out |= _flatten(value, f"{prefix}{key}.") if isinstance(value, dict) else {prefix + key: value}
+        out |= (
+            _flatten(value, f"{prefix}{key}.") if isinstance(value, dict) else {prefix + key: value}
+        )
     return out
 
 

@@ -75,7 +75,9 @@ def wrap(text: str) -> str:
     from textwrap import TextWrapper
 
     try:
-        columns = int(os.environ.get("COLUMNS") or 0) or os.get_terminal_size(sys.stderr.fileno()).columns
+        columns = (
+            int(os.environ.get("COLUMNS") or 0) or os.get_terminal_size(sys.stderr.fileno()).columns
+        )
     except (OSError, ValueError):
         return text
     wrapper = TextWrapper(columns or 80, break_long_words=False, break_on_hyphens=False)
@@ -146,7 +148,10 @@ class Console:
         return self
 
     def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, where: TracebackType | None
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        where: TracebackType | None,
     ) -> None:
         self.close()
 
@@ -173,7 +178,9 @@ class Console:
             self._clear()
             print(wrap(f"g2ard: {text}"), file=sys.stderr, flush=True)
 
-    def table(self, title: str, columns: list[str], rows: list[list[str]], *, stdout: bool = False) -> None:
+    def table(
+        self, title: str, columns: list[str], rows: list[list[str]], *, stdout: bool = False
+    ) -> None:
         """Print a table; columns with a header are right-aligned, except the first.
 
         Figures stay on one line: a table that is too wide for its terminal becomes a list.
@@ -186,7 +193,9 @@ class Console:
         table = Table(show_header=any(columns))
         for i, name in enumerate(columns):
             number = bool(i and name)
-            table.add_column(name, justify="right" if number else "left", overflow="fold", no_wrap=number)
+            table.add_column(
+                name, justify="right" if number else "left", overflow="fold", no_wrap=number
+            )
         for row in rows:
             table.add_row(*row)
         stream = sys.stdout if stdout else sys.stderr
@@ -195,7 +204,10 @@ class Console:
         with self._lock:
             self._clear()
             screen.print(title, markup=False, highlight=False, soft_wrap=not stream.isatty())
-            if table.show_header and min(first, _NAME) + sum(others) + 3 * len(columns) + 1 > screen.width:
+            if (
+                table.show_header
+                and min(first, _NAME) + sum(others) + 3 * len(columns) + 1 > screen.width
+            ):
                 for row in rows:
                     figures = zip(columns[1:], row[1:], strict=True)
                     told = [_format_figure(name, cell) for name, cell in figures if cell]
@@ -209,7 +221,9 @@ class Console:
             self._clear()
             print(text, flush=True)
 
-    def __call__(self, stage: str, done: int, total: int, info: Mapping[str, Any] | None = None) -> None:
+    def __call__(
+        self, stage: str, done: int, total: int, info: Mapping[str, Any] | None = None
+    ) -> None:
         """Show the progress of a stage, with the figures of `info`; a total of 0 is unknown."""
         if self.quiet:
             return
@@ -310,10 +324,14 @@ class Console:
             if len(figure) + 2 <= free - bar - 2:
                 cells.append(figure)
                 free -= len(figure) + 2
-        row: list[RenderableType] = [Text(cell, no_wrap=True, overflow="ellipsis") for cell in cells]
+        row: list[RenderableType] = [
+            Text(cell, no_wrap=True, overflow="ellipsis") for cell in cells
+        ]
         if bar:
             width = min(free, _BAR[1])
-            row.insert(1, ProgressBar(stage.total or None, stage.done, width=width, pulse=stage.total < 2))
+            row.insert(
+                1, ProgressBar(stage.total or None, stage.done, width=width, pulse=stage.total < 2)
+            )
         table = Table.grid(padding=(0, 2, 0, 0))
         table.add_row(*row)
         return table

@@ -6,7 +6,15 @@ import typer
 
 from g2ard.cli.budget_options import Options
 from g2ard.cli.options import duration
-from g2ard.config.choices import AdaptSchedule, Engine, Focus, Method, Policy, Refinement, ScheduleName
+from g2ard.config.choices import (
+    AdaptSchedule,
+    Engine,
+    Focus,
+    Method,
+    Policy,
+    Refinement,
+    ScheduleName,
+)
 from g2ard.errors import InputError
 
 
@@ -28,7 +36,9 @@ def _spot(text: str) -> Spot:
         raise typer.BadParameter(f"expected X,Y,Z,R or X,Y,Z,X,Y,Z, got {text!r}") from None
 
 
-_SH_DEGREE = typer.Option(min=0, max=3, help="SH degree of the result; by default that of the scene.")
+_SH_DEGREE = typer.Option(
+    min=0, max=3, help="SH degree of the result; by default that of the scene."
+)
 ShDegreeOption = Annotated[int | None, _SH_DEGREE]
 _ENGINE = typer.Option(
     help="Engine of the steps, with equal results up to rounding: fused (Rust or --device gpu, the "
@@ -48,7 +58,9 @@ FIELDS: Options = {
     "select.policy": (Policy, typer.Option(help="Selection criterion.")),
     "select.focus": (
         Focus,
-        typer.Option(help="Make half of the training views of this kind; far: only the usual ones."),
+        typer.Option(
+            help="Make half of the training views of this kind; far: only the usual ones."
+        ),
     ),
     "recover.schedule": (
         ScheduleName,
@@ -59,34 +71,44 @@ FIELDS: Options = {
     ),
     "recover.steps": (
         int,
-        typer.Option(min=1, help="Steps of the last recovery; by default as many as the schedule needs."),
+        typer.Option(
+            min=1, help="Steps of the last recovery; by default as many as the schedule needs."
+        ),
     ),
     "recover.recovery_time": (
         float,
-        typer.Option(parser=duration, metavar="TIME", help="Time limit for recovery alone: 90s, 2m or 1h."),
+        typer.Option(
+            parser=duration, metavar="TIME", help="Time limit for recovery alone: 90s, 2m or 1h."
+        ),
     ),
     **{f"{stage}.sh_degree": (int, _SH_DEGREE) for stage in ("recover", "adapt")},
     **{f"{stage}.engine": (Engine, _ENGINE) for stage in ("recover", "adapt")},
     "adapt.steps": (
         int,
-        typer.Option(min=1, help="Maximum steps; by default 50 per image, at least 250 and at most 7,000."),
+        typer.Option(
+            min=1, help="Maximum steps; by default 50 per image, at least 250 and at most 7,000."
+        ),
     ),
     "adapt.tolerance": (
         float,
         typer.Option(
-            min=0, help="Stop when PSNR gains less than this, dB; 0.05 by default, 0 runs all steps."
+            min=0,
+            help="Stop when PSNR gains less than this, dB; 0.05 by default, 0 runs all steps.",
         ),
     ),
     "adapt.schedule": (AdaptSchedule, typer.Option(help="Learning rates and decay.")),
     "adapt.prior_views": (
         float,
         typer.Option(
-            min=0, help="Weight of the old appearance, as a number of views; 1 by default, 0 in the paper."
+            min=0,
+            help="Weight of the old appearance, as a number of views; 1 by default, 0 in the paper.",
         ),
     ),
     "register.size": (
         int,
-        typer.Option(min=32, metavar="PIXELS", help="Shrink photos to this longer side; 1000 by default."),
+        typer.Option(
+            min=32, metavar="PIXELS", help="Shrink photos to this longer side; 1000 by default."
+        ),
     ),
     "register.matcher": (
         str,

@@ -33,7 +33,8 @@ def run_program(app: typer.Typer, name: str) -> None:
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     _open_streams()
     sys.stdout, sys.stderr = _Outliving(sys.stdout), _Outliving(sys.stderr)
-    gc.set_threshold(50_000)  # imports create no garbage; looking for it takes 5 % of a short command
+    # imports create no garbage; looking for it takes 5 % of a short command
+    gc.set_threshold(50_000)
     try:
         status = app(prog_name=name, standalone_mode=False)
     except typer.Abort:

@@ -66,11 +66,14 @@ ViewsOrMadeOption = Annotated[
     ),
 ]
 ImagesOption = Annotated[
-    Path | None, typer.Option(metavar="DIR", help="Folder of the photos of the views, if they are elsewhere.")
+    Path | None,
+    typer.Option(metavar="DIR", help="Folder of the photos of the views, if they are elsewhere."),
 ]
 AlphaOption = Annotated[
     Alpha,
-    typer.Option(help="Photos with alpha: composite them over the background, or mask what is transparent."),
+    typer.Option(
+        help="Photos with alpha: composite them over the background, or mask what is transparent."
+    ),
 ]
 
 
@@ -123,7 +126,9 @@ def numbers(option: str, text: str, count: int) -> list[float]:
     """
     found = _floats(text)
     if len(found) != count:
-        raise typer.BadParameter(f"{option}: expected {count} comma-separated numbers, got {text!r}")
+        raise typer.BadParameter(
+            f"{option}: expected {count} comma-separated numbers, got {text!r}"
+        )
     return found
 
 
@@ -156,16 +161,22 @@ def choose_points(run: Run, source: Source | None) -> None:
 UpOption = Annotated[
     Triple | None,
     typer.Option(
-        parser=_direction, metavar="X,Y,Z", help="Up direction for generated views; estimated by default."
+        parser=_direction,
+        metavar="X,Y,Z",
+        help="Up direction for generated views; estimated by default.",
     ),
 ]
 
 
 SplitOption = Annotated[
     str,
-    typer.Option(metavar="train|test|all", help="Views to use; every 8th is test unless a split is given."),
+    typer.Option(
+        metavar="train|test|all", help="Views to use; every 8th is test unless a split is given."
+    ),
 ]
-FormatOption = Annotated[FormatName, typer.Option(case_sensitive=False, help="Format of the scene in RUN.")]
+FormatOption = Annotated[
+    FormatName, typer.Option(case_sensitive=False, help="Format of the scene in RUN.")
+]
 ViewFormatOption = Annotated[
     ViewFormat | None,
     typer.Option(
@@ -203,7 +214,9 @@ DryRunOption = Annotated[
 ResumeOption = Annotated[bool, typer.Option("--resume", help="Continue an interrupted run.")]
 SizeOption = Annotated[
     int | None,
-    typer.Option(min=16, metavar="PIXELS", help="Longer side of the images; photos only shrink to it."),
+    typer.Option(
+        min=16, metavar="PIXELS", help="Longer side of the images; photos only shrink to it."
+    ),
 ]
 
 
@@ -257,7 +270,9 @@ TimeOption = Annotated[
 BackgroundOption = Annotated[
     Triple | None,
     typer.Option(
-        parser=_colour, metavar="COLOUR", help="Background: black (default), white or R,G,B in [0, 1]."
+        parser=_colour,
+        metavar="COLOUR",
+        help="Background: black (default), white or R,G,B in [0, 1].",
     ),
 ]
 
@@ -283,7 +298,9 @@ def background_of(run: Run, given: Triple | None, *scenes: Path | None) -> Tripl
 
 TeacherOption = Annotated[
     Path | None,
-    typer.Option(metavar="SCENE", help="Train on or score against renders of this scene instead of photos."),
+    typer.Option(
+        metavar="SCENE", help="Train on or score against renders of this scene instead of photos."
+    ),
 ]
 PhotosOption = Annotated[
     bool,
@@ -294,7 +311,8 @@ PhotosOption = Annotated[
     ),
 ]
 ConventionOption = Annotated[
-    Convention, typer.Option(help="Renderer to follow; inria has near plane 0.2 and cuts splats at 3σ tiles.")
+    Convention,
+    typer.Option(help="Renderer to follow; inria has near plane 0.2 and cuts splats at 3σ tiles."),
 ]
 
 PresetOption = Annotated[

@@ -20,7 +20,9 @@ def read_budgets(run: Run, *, optional: bool = False) -> list[Budget]:
     if not kinds and optional:
         return []
     if not kinds:
-        raise typer.BadParameter(f"say how small the result is to be, as -r 10 does: {BUDGET_FLAGS}")
+        raise typer.BadParameter(
+            f"say how small the result is to be, as -r 10 does: {BUDGET_FLAGS}"
+        )
     if kinds > 1:
         raise typer.BadParameter(f"the result can have one size alone; keep one of {BUDGET_FLAGS}")
     if fit is not None or quality:
@@ -74,7 +76,8 @@ class Outputs:
         self._check = check
         self._name = name
         self._checked: set[Path] = set()
-        words = set(re.findall(r"{[a-z_]*}", pattern.name))  # braces elsewhere, as of a GUID, mean themselves
+        # braces elsewhere, as of a GUID, mean themselves
+        words = set(re.findall(r"{[a-z_]*}", pattern.name))
         if strange := words - {"{ratio}", "{count}"}:
             raise typer.BadParameter(
                 f"{name}: unknown placeholder {min(strange)}; use {{ratio}} or {{count}}"
@@ -127,7 +130,9 @@ class Outputs:
     def _fill_in(self, budget: Budget, total: int | None) -> str:
         name = self._pattern
         if "{ratio}" in name:
-            ratio = budget.ratio if budget.ratio is not None else (total or 0) / budget.of(total or 0)
+            ratio = (
+                budget.ratio if budget.ratio is not None else (total or 0) / budget.of(total or 0)
+            )
             name = name.replace("{ratio}", f"{ratio:.4g}")
         if "{count}" in name:
             count = budget.count if budget.count is not None else budget.of(total or 0)

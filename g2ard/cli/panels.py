@@ -17,7 +17,17 @@ USED: dict[str, tuple[str, ...]] = {
         *("size", "schedule", "steps", "recovery_time", "background", "resume"),
     ),
     "adapt": ("output", "views", "teacher", "images", "size", "steps", "background", "resume"),
-    "register": ("output", "photos", "poses", "pool", "focal", "intrinsics", "size", "matcher", "report"),
+    "register": (
+        "output",
+        "photos",
+        "poses",
+        "pool",
+        "focal",
+        "intrinsics",
+        "size",
+        "matcher",
+        "report",
+    ),
     "lift": ("output", "box", "where", "color", "overwrite"),
     "ingest": ("output", "tile_rows", "overwrite"),
     "convert": (
@@ -32,7 +42,17 @@ USED: dict[str, tuple[str, ...]] = {
         *("size", "background", "split", "depth", "overwrite"),
     ),
     "view": ("output", "views", "start", "background", "up", "overwrite"),
-    "lod": ("output", "kind", "ratios", "recover", "views", "size", "place", "environment", "resume"),
+    "lod": (
+        "output",
+        "kind",
+        "ratios",
+        "recover",
+        "views",
+        "size",
+        "place",
+        "environment",
+        "resume",
+    ),
     "evaluate": (
         *("output", "views", "teacher", "photos", "images"),
         *("split", "size", "background", "lpips", "json"),
@@ -45,7 +65,17 @@ USED: dict[str, tuple[str, ...]] = {
 _PANELS = {
     "Budget": ("count", "ratio", "ratios", "fit", "min_psnr", "min_ssim"),
     "Views": (
-        *("views", "images", "alpha", "teacher", "photos", "held_out", "split", "size", "background"),
+        *(
+            "views",
+            "images",
+            "alpha",
+            "teacher",
+            "photos",
+            "held_out",
+            "split",
+            "size",
+            "background",
+        ),
         *("up", "focus", "no_views", "poses", "pool", "intrinsics", "focal", "views_format"),
     ),
     "Method": (
@@ -89,7 +119,11 @@ def ordered(command: str, parameters: list[Parameter]) -> list[Parameter]:
             return 0, used.index(parameter.name), 0
         topic = _TOPICS.get(parameter.name, "Output")
         names = _PANELS[topic]
-        return 1, topics.index(topic), names.index(parameter.name) if parameter.name in names else len(names)
+        return (
+            1,
+            topics.index(topic),
+            names.index(parameter.name) if parameter.name in names else len(names),
+        )
 
     return sorted(parameters, key=place)  # stable: arguments are shown apart
 

@@ -62,7 +62,9 @@ def check_same(run: Run, record: Mapping[str, Any], output: Path, *others: str) 
             different.append(name.replace("_", "-"))
     hint = "-w without --resume starts over"
     if different:
-        raise OutputError(f"finished with other options ({', '.join(different)})", path=output, hint=hint)
+        raise OutputError(
+            f"finished with other options ({', '.join(different)})", path=output, hint=hint
+        )
     changed = _find_changed_files(run, record.get("inputs", {}))
     if changed:
         raise OutputError(f"finished before {min(changed)} changed", path=output, hint=hint)
@@ -88,7 +90,9 @@ def identify_files(files: Iterable[Path]) -> Named:
     """Return the identity of each file by its path, relative to the working folder if it is inside."""
     here = real_path(".")
     absolute = {real_path(path) for path in files}
-    paths = sorted(path.relative_to(here) if path.is_relative_to(here) else path for path in absolute)
+    paths = sorted(
+        path.relative_to(here) if path.is_relative_to(here) else path for path in absolute
+    )
     return dict(zip(map(str, paths), file_identity(paths), strict=True))
 
 
@@ -121,7 +125,8 @@ def record_finish(run: Run, output: Path) -> Iterator[None]:
     if is_taken(output):
         record = {"config": run.config, "inputs": inputs, "output": file_identity([output])}
         text = json.dumps(record, default=str)
-        with suppress(OSError, OutputError):  # without a cache, --resume answers that the output exists
+        # without a cache, --resume answers that the output exists
+        with suppress(OSError, OutputError):
             file = _place_record(output)
             file.parent.mkdir(parents=True, exist_ok=True)
             with atomic_output(file, overwrite=True) as temporary:
@@ -186,7 +191,9 @@ def check_stopped(run: Run, place: Path, resume: bool, output: Path) -> None:
     if resume and not left:
         run.say(f"{output}: nothing to resume, starting over")
     if left and not (resume or run.overwrite):
-        raise OutputError("left by an interrupted run; --resume continues it, -w starts over", path=place)
+        raise OutputError(
+            "left by an interrupted run; --resume continues it, -w starts over", path=place
+        )
 
 
 @contextmanager
@@ -201,7 +208,10 @@ def stoppable(run: Run, place: Path, resume: bool, output: Path) -> Iterator[Non
             if is_taken(output) and not run.overwrite:  # another run wrote it since it was checked
                 raise OutputError("exists", path=output, hint="{overwrite=True} replaces it")
             _drop_temporaries(place, output)
-            with keep_checkpoints(run, place, resume, output, f"from {place}"), record_finish(run, output):
+            with (
+                keep_checkpoints(run, place, resume, output, f"from {place}"),
+                record_finish(run, output),
+            ):
                 yield
     finally:
         drop_empty(made)
@@ -259,7 +269,8 @@ def tell_start(run: Run, place: Path, what: Path) -> None:
 
 def list_finished_steps(place: Path) -> list[str]:
     """Return the names of finished steps in a folder of checkpoints."""
-    stems = (path.stem for path in sorted(place.glob("[!.]*.npz")))  # the name, and a hash of 16 digits
+    # the name, and a hash of 16 digits
+    stems = (path.stem for path in sorted(place.glob("[!.]*.npz")))
     return list(dict.fromkeys(stem[:-17] for stem in stems if not stem.endswith(".checkpoint")))
 
 

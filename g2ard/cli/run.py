@@ -51,7 +51,9 @@ class Run(Claims):
         fields: Sequence[str] = (),
     ) -> None:
         given = (*options.values(), common["config"])
-        super().__init__(given, (*map(options.get, outputs), common.get("work")), common["overwrite"])
+        super().__init__(
+            given, (*map(options.get, outputs), common.get("work")), common["overwrite"]
+        )
         self.name = name
         self.flags = flags  # parameter → flag
         self.fields = fields  # paths of settings that have flags
@@ -66,10 +68,14 @@ class Run(Claims):
         self.typed: frozenset[str] = frozenset()  # options given on the command line
         self.noted = False  # whether a GPU failed
         self._adapter: str | None = None  # last adapter in use
-        self.kept: list[str] = []  # outputs and checkpoints that remain, for messages of errors and Ctrl-C
+        # outputs and checkpoints that remain, for messages of errors and Ctrl-C
+        self.kept: list[str] = []
         self._failed: str | None = None  # what an error ended after the scene was written
         self._unshown: Exception | None = None  # the error of a page or picture
-        told = {**options, **{name: value for name, value in common.items() if name not in _UNRECORDED}}
+        told = {
+            **options,
+            **{name: value for name, value in common.items() if name not in _UNRECORDED},
+        }
         self.config = {name: _flat(value) for name, value in told.items()}
 
     @property
@@ -116,7 +122,9 @@ class Run(Claims):
         """Raise a usage error if an option without effect is on the command line; the reason ends it."""
         for name in names:
             if name in self.typed:
-                raise typer.BadParameter(f"{self.flags.get(name, name)} has no effect {reason}; remove it")
+                raise typer.BadParameter(
+                    f"{self.flags.get(name, name)} has no effect {reason}; remove it"
+                )
 
     @contextmanager
     def finishing(self, what: str) -> Iterator[None]:
@@ -154,7 +162,9 @@ class Run(Claims):
         """Remember an output that is complete, for messages of later errors."""
         self.kept.append(f"{path} is written")
 
-    def progress(self, stage: str, done: int, total: int, info: Mapping[str, Any] | None = None) -> None:
+    def progress(
+        self, stage: str, done: int, total: int, info: Mapping[str, Any] | None = None
+    ) -> None:
         """Report progress, after GPU messages since the last call."""
         self.tell_notes()
         self.console(stage, done, total, info)
@@ -189,7 +199,9 @@ class Run(Claims):
     def say_dry(self) -> None:
         """Say what a dry run writes."""
         to_file = self.json not in (None, "-")
-        self.say(f"dry run: only {self.json} is written" if to_file else "dry run: nothing is written")
+        self.say(
+            f"dry run: only {self.json} is written" if to_file else "dry run: nothing is written"
+        )
 
     def result(self, data: Named) -> None:
         """Write the result and the resolved options to --json."""
@@ -197,7 +209,11 @@ class Run(Claims):
             return
         state = devices.state() if self.device in ("auto", "gpu") else None
         if state is not None and state.served:
-            used = {"adapter": state.adapter, "kernels": state.served, "uploaded_bytes": state.uploaded_bytes}
+            used = {
+                "adapter": state.adapter,
+                "kernels": state.served,
+                "uploaded_bytes": state.uploaded_bytes,
+            }
             data = {**data, "device": used}
         with self.finishing("--json"):
             text = json.dumps({**data, "config": self.config}, indent=2, default=plain)
@@ -270,7 +286,9 @@ class Run(Claims):
         from g2ard.io.views import lost_views, view_format
 
         overwrite = self.overwrite or overwrite
-        write_views(path, cameras, splits=splits, weights=weights, format=format, overwrite=overwrite)
+        write_views(
+            path, cameras, splits=splits, weights=weights, format=format, overwrite=overwrite
+        )
         self.note_written(path)
         if lost := lost_views(cameras, view_format(path, format), splits, weights is not None):
             self.say(

@@ -78,7 +78,8 @@ class RunFolder:
         self.scene = path / name
         self.unfinished = path / _WORK_FOLDER
         self._report = path / "report.json"  # written last
-        self._simplified = path / "simplified" / "scene.ply"  # with --keep, for `evaluate --anchors`
+        # with --keep, for `evaluate --anchors`
+        self._simplified = path / "simplified" / "scene.ply"
         self._view = path / "view.html"
         self._views = path / "views.json"
         self._scored = path / "scored.json"  # if some scored views are not in views.json
@@ -92,7 +93,9 @@ class RunFolder:
         )
         check_unlocked(self.path)
         left = has_checkpoints(self.unfinished)
-        killed = self.path.is_dir() and [path.name for path in self.path.iterdir()] == [_WORK_FOLDER]
+        killed = self.path.is_dir() and [path.name for path in self.path.iterdir()] == [
+            _WORK_FOLDER
+        ]
         done = self._resume and not self._run.overwrite and not left
         done = done and self.scene.exists() and self._report.exists()
         if done:
@@ -100,7 +103,9 @@ class RunFolder:
             if not (lacking := self._find_lacking(record)):
                 self._run.say(f"{self.path}: already finished; -w without --resume starts over")
                 return record
-            self._run.say(f"{self.path}: finished without {', '.join(lacking)}; the run is repeated")
+            self._run.say(
+                f"{self.path}: finished without {', '.join(lacking)}; the run is repeated"
+            )
             self._run.overwrite = True
         if not left and not killed:
             check_output(self.path, self._run.overwrite, folder=True)
@@ -123,7 +128,8 @@ class RunFolder:
         asked = {
             "--keep": now["keep"] and not self._simplified.exists(),
             "--page": now["page"] and not then.get("page", True),
-            "--views-format": now["views_format"] not in (*_VIEW_DEFAULTS, then.get("views_format")),
+            "--views-format": now["views_format"]
+            not in (*_VIEW_DEFAULTS, then.get("views_format")),
         }
         return [name for name, lacks in asked.items() if lacks]
 
@@ -138,7 +144,9 @@ class RunFolder:
         self.path.mkdir(parents=True, exist_ok=True)
         try:
             with locked(self.path):
-                if self.scene.exists() and not (self._run.overwrite or has_checkpoints(self.unfinished)):
+                if self.scene.exists() and not (
+                    self._run.overwrite or has_checkpoints(self.unfinished)
+                ):
                     raise OutputError("exists", path=self.path, hint="{overwrite=True} replaces it")
                 drop_temporaries(self.path)
                 with self._hold_checkpoints(job):
@@ -151,7 +159,9 @@ class RunFolder:
         """Create the folder for checkpoints; after an error or Ctrl-C, keep what it holds."""
         if self._resume and not has_checkpoints(self.unfinished):
             self._run.say(f"{self.path}: nothing to resume, starting over")
-        with keep_checkpoints(self._run, self.unfinished, self._resume, self.path, f"in {self.path}"):
+        with keep_checkpoints(
+            self._run, self.unfinished, self._resume, self.path, f"in {self.path}"
+        ):
             self.unfinished.mkdir(parents=True, exist_ok=True)
             counts = {"input_count": job.total, "output_count": job.budget.count}
             text = json.dumps({**counts, "config": self._run.config}, default=str)
@@ -166,7 +176,8 @@ class RunFolder:
         """
         run = self._run
         if self.unfinished.is_dir():
-            (self.unfinished / "written").touch()  # from now on, --resume may replace this run's files
+            # from now on, --resume may replace this run's files
+            (self.unfinished / "written").touch()
         run.write(self.scene, done.splats, overwrite=True, compare=False)
         pages = (self.path / name for name in ("report.json", "report.html", _PICTURE, "view.html"))
         for other in (*self._list_other_scenes(), *pages):
@@ -183,7 +194,9 @@ class RunFolder:
         write_views(self._views, own.cameras, splits=own.splits, overwrite=True)
         also: ViewFormat = run.config["views_format"]
         if views.pool is not None and also in _VIEW_FILES:
-            run.write_views(self.path / _VIEW_FILES[also], own.cameras, also, own.splits, overwrite=True)
+            run.write_views(
+                self.path / _VIEW_FILES[also], own.cameras, also, own.splits, overwrite=True
+            )
         if targets.apart is None:
             self._scored.unlink(missing_ok=True)
             return
@@ -213,7 +226,8 @@ class RunFolder:
         )
 
         title = f"{name_scenes([Path(str(source))])[0]}: {report.title}"
-        scenes = [] if report.photos else [("simplified", done.simplified)]  # a start of photos is a blur
+        # a start of photos is a blur
+        scenes = [] if report.photos else [("simplified", done.simplified)]
         scenes.append((RESULT, done.splats))
         recover = job.config.recover
         page = self.path / "report.html"
@@ -234,15 +248,26 @@ class RunFolder:
             config = self._run.config
             of_points = isinstance(source, Source) and source.kind == "points"
             alone = not config["compare"] or str(config["fit"]).startswith("page:")
-            if not alone and isinstance(source, Source) and not recover.from_points and job.plan is None:
+            if (
+                not alone
+                and isinstance(source, Source)
+                and not recover.from_points
+                and job.plan is None
+            ):
                 dense = source, job.prior
             seen = job.views.train.cameras if job.views.pool is None else best.cameras
             size = None
             with self._run.showing("view.html"):
-                size, line = self.write_view(done.splats, dense, seen, recover.background, of_points)
+                size, line = self.write_view(
+                    done.splats, dense, seen, recover.background, of_points
+                )
             report = replace(report, bytes={**report.bytes, "view": size})
         with self._run.showing("report.html"):
-            files = {self.scene.name: self.scene.name, "view in the browser": self._view.name, "folder": "."}
+            files = {
+                self.scene.name: self.scene.name,
+                "view in the browser": self._view.name,
+                "folder": ".",
+            }
             files = {text: name for text, name in files.items() if (self.path / name).exists()}
             command = shlex.join(["g2ard", *sys.argv[1:]])
             more: Any = {"best": shown[0], "on_white": on_white, "command": command, "files": files}
@@ -251,7 +276,10 @@ class RunFolder:
 
     def write_report(self, report: Report) -> None:
         told = {**report.as_dict(), "config": self._run.config, "inputs": self._inputs}
-        with self._run.finishing("report.json"), atomic_output(self._report, overwrite=True) as temporary:
+        with (
+            self._run.finishing("report.json"),
+            atomic_output(self._report, overwrite=True) as temporary,
+        ):
             text = json.dumps(told, indent=2, default=plain)
             temporary.write_text(text + "\n", encoding="utf-8", newline="\n")
 
@@ -274,7 +302,10 @@ class RunFolder:
         count = len(splats)
         most = DEVICES["web"]
         if count > most:
-            return None, f"{self._view} skipped: over {most:,} Gaussians (`g2ard view` writes it anyway)"
+            return (
+                None,
+                f"{self._view} skipped: over {most:,} Gaussians (`g2ard view` writes it anyway)",
+            )
         stand = place_frame(splats, cameras)
         behind = self._choose_backdrop(background, splats if dense is None else dense[1], of_points)
         shown: list[Source | str] = [name_scenes([self.path])[0]]
@@ -289,9 +320,13 @@ class RunFolder:
         return written, f"view: {self._view} ({written / 1e6:.2f} MB)"
 
     @staticmethod
-    def _choose_backdrop(background: Colour, scene: Splats, of_points: bool = False) -> Colour | None:
+    def _choose_backdrop(
+        background: Colour, scene: Splats, of_points: bool = False
+    ) -> Colour | None:
         """Return what is behind a scene in pictures and on pages, see `choose_backdrop`."""
-        return choose_backdrop(None if background == BLACK else background, [scene], of_points=of_points)
+        return choose_backdrop(
+            None if background == BLACK else background, [scene], of_points=of_points
+        )
 
     def say_files(self, page: str = "") -> None:
         """Name the files, and record that the run is finished."""
@@ -313,7 +348,8 @@ def _join_views(cameras: Cameras, held_out: Cameras) -> Cameras:
     """Combine views, and mark names of held-out ones that other views have too."""
     taken = set(cameras.names)
     named = (
-        replace(view, name=f"{view.name} (held out)") if view.name in taken else view for view in held_out
+        replace(view, name=f"{view.name} (held out)") if view.name in taken else view
+        for view in held_out
     )
     return Cameras.of([*cameras, *named])
 

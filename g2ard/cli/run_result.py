@@ -96,9 +96,16 @@ def say_views(run: Run, views: ViewsReport | None, chosen: bool) -> None:
 
 def say_fit(run: Run, source: Path, budget: Budget, name: str) -> None:
     """Say that a file already has the bytes of a budget; `name` is that of the output."""
-    if budget.bytes is None or budget.of_page or not source.is_file() or source.stat().st_size > budget.bytes:
+    if (
+        budget.bytes is None
+        or budget.of_page
+        or not source.is_file()
+        or source.stat().st_size > budget.bytes
+    ):
         return
-    fits = f"{source.name} has {source.stat().st_size / 1e6:.2f} MB, which already fits {budget.fit}"
+    fits = (
+        f"{source.name} has {source.stat().st_size / 1e6:.2f} MB, which already fits {budget.fit}"
+    )
     ours = scene_format(name).suffix
     if next((suffix for suffix in SUFFIXES if source.name.lower().endswith(suffix)), None) == ours:
         run.say(f"nothing to do: {fits}")
@@ -106,7 +113,9 @@ def say_fit(run: Run, source: Path, budget: Budget, name: str) -> None:
         run.say(f"{fits}; only its size as {ours} counts")
 
 
-def say_weight(run: Run, source: Path, output: Path, splats: Splats, *, lifted: Splats | None = None) -> None:
+def say_weight(
+    run: Run, source: Path, output: Path, splats: Splats, *, lifted: Splats | None = None
+) -> None:
     """Print a hint if the output is larger than its source file, or than the `lifted` points."""
     inputs = [] if lifted is None else [(lifted.nbytes, "the lifted points have")]
     if source.is_file() and source.suffix.lower() != ".json":
@@ -119,7 +128,9 @@ def say_weight(run: Run, source: Path, output: Path, splats: Splats, *, lifted: 
     if share := splats.shN.nbytes / splats.nbytes:
         why = f"; {share:.0%} of it is SH above degree 0, which --sh-degree 0 removes"
     smaller = (
-        "" if output.suffix == ".sog" else f"; smaller: g2ard convert {output} {output.with_suffix('.sog')}"
+        ""
+        if output.suffix == ".sog"
+        else f"; smaller: g2ard convert {output} {output.with_suffix('.sog')}"
     )
     run.say(f"{output}: {made / 1e6:.2f} MB, {what} {given / 1e6:.2f} MB{why}{smaller}")
 

@@ -70,7 +70,8 @@ def describe_usage_error(error: typer.TyperException) -> str:
     long = _find_single_dash(error)
     if long is not None:
         return f"{long[1:]}: long options need two dashes; write {long}"
-    if isinstance(error, typer.BadParameter) and parameter is None:  # a check of several options at once
+    # a check of several options at once
+    if isinstance(error, typer.BadParameter) and parameter is None:
         return error.message
     if refused is None or parameter is None:
         return " ".join(error.format_message().split())
@@ -92,7 +93,8 @@ def _list_missing(error: Any) -> list[str]:
         given |= {word.partition("=")[0], word[:2]}
     missing = [p for p in options if not given & {*p.opts, p.name}]
     found = [f"{min(p.opts, key=len)} {p.metavar or p.name.upper()}" for p in missing if p.required]
-    if {p.name for p in missing} >= BUDGETS.keys():  # some commands have a budget for one option alone
+    # some commands have a budget for one option alone
+    if {p.name for p in missing} >= BUDGETS.keys():
         found.append(f"a budget ({BUDGET_FLAGS})")
     return found
 

@@ -40,12 +40,16 @@ def read_tiling(run: Run, source: Source | None, output: Path) -> Tiling:
     with run.usage():
         size = None if memory is None else parse_bytes(memory)
     if scheduler is not None and scheduler != "local" and "://" not in scheduler:
-        raise typer.BadParameter(f"--scheduler: expected tcp://HOST:PORT or local, got {scheduler!r}")
+        raise typer.BadParameter(
+            f"--scheduler: expected tcp://HOST:PORT or local, got {scheduler!r}"
+        )
     folder = work or _place_beside(output)
     run.claim("--work", folder, folder=True)
     cores = run.threads or None
     renew = work is None or run.overwrite
-    return Tiling(rows, size, workers, cores, scheduler, folder, keep=work is not None, overwrite=renew)
+    return Tiling(
+        rows, size, workers, cores, scheduler, folder, keep=work is not None, overwrite=renew
+    )
 
 
 def _place_beside(output: Path) -> Path:
@@ -73,7 +77,9 @@ def _check_rows(source: Source, rows: int) -> None:
 
 
 @contextmanager
-def work_folder(run: Run, tiling: Tiling | None, *views: Views | None, again: str = "") -> Iterator[None]:
+def work_folder(
+    run: Run, tiling: Tiling | None, *views: Views | None, again: str = ""
+) -> Iterator[None]:
     """Hold `tiling.folder`, created if absent, while a command works on tiles there; do nothing for None.
 
     Finished tasks in it are not computed again, with or without --resume and --overwrite: their names hash
@@ -130,14 +136,17 @@ def _check_folder(folder: Path) -> None:
     try:
         names = sorted(path.name for path in folder.iterdir()) if folder.exists() else []
     except OSError as error:
-        raise OutputError(f"cannot write: {error.strerror}; choose another folder", path=folder) from error
+        raise OutputError(
+            f"cannot write: {error.strerror}; choose another folder", path=folder
+        ) from error
     from g2ard.tiles.writer import is_tile_file
 
     of_tiles = [name for name in names if is_tile_file(name)]
     others = [name for name in names if not name.startswith(".")]
     if of_tiles or (others and not any(map(_WORK_NAME.fullmatch, names))):
         raise OutputError(
-            f"holds {(of_tiles or others)[0]} and is not a work folder; choose another folder", path=folder
+            f"holds {(of_tiles or others)[0]} and is not a work folder; choose another folder",
+            path=folder,
         )
 
 
@@ -157,4 +166,6 @@ def _worth_keeping(folder: Path, error: Exception) -> bool:
     """Return whether a command that resumes after this error finds something done."""
     if any((folder / "steps").glob("[!.]*.npz")):
         return True
-    return isinstance(error, OutputError) and any(path.name != "tiles" for path in folder.glob("[!.]*/[!.]*"))
+    return isinstance(error, OutputError) and any(
+        path.name != "tiles" for path in folder.glob("[!.]*/[!.]*")
+    )

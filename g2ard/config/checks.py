@@ -10,7 +10,17 @@ from dataclasses import dataclass, fields
 from difflib import get_close_matches
 from functools import cache, wraps
 from numbers import Integral, Real
-from typing import Annotated, Any, Literal, ParamSpec, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import (
+    Annotated,
+    Any,
+    Literal,
+    ParamSpec,
+    TypeVar,
+    Union,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
 
 from g2ard.config.choices import Engine
 from g2ard.errors import InputError, UsageError, require
@@ -86,7 +96,9 @@ def check_type(name: str, value: Any, kind: Any) -> None:
         got = repr(value)
         if len(got) > _LONGEST or "\n" in got:
             got = f"a value of type {type(value).__name__}"
-        one = isinstance(value, list | tuple) and all(bare(option) in _SCALARS for option in options_of(kind))
+        one = isinstance(value, list | tuple) and all(
+            bare(option) in _SCALARS for option in options_of(kind)
+        )
         wanted, hint = ("one value", "call once per value") if one else (described(kind), None)
         raise InputError(f"expected {wanted}, got {got}", parameter=name, hint=hint)
 
@@ -108,7 +120,9 @@ def check_direction(name: str, direction: Any) -> None:
     """Reject a direction that is not three finite numbers, or zero."""
     check_vector(name, direction)
     if not any(direction):
-        raise InputError(f"expected three finite numbers, not all zero, got {direction!r}", parameter=name)
+        raise InputError(
+            f"expected three finite numbers, not all zero, got {direction!r}", parameter=name
+        )
 
 
 def check_colour(name: str, colour: Any) -> None:
@@ -120,8 +134,12 @@ def check_colour(name: str, colour: Any) -> None:
     """
     if hasattr(colour, "tolist"):
         colour = colour.tolist()
-    if not _fits(colour, tuple[float, float, float]) or not all(0 <= channel <= 1 for channel in colour):
-        raise InputError(f"expected 3 numbers from 0 to 1 (red, green, blue), got {colour!r}", parameter=name)
+    if not _fits(colour, tuple[float, float, float]) or not all(
+        0 <= channel <= 1 for channel in colour
+    ):
+        raise InputError(
+            f"expected 3 numbers from 0 to 1 (red, green, blue), got {colour!r}", parameter=name
+        )
 
 
 _SHARED = {"seed": check_seed, "up": check_direction, "background": check_colour}
@@ -278,13 +296,19 @@ def _fits(value: Any, kind: Any) -> bool:
             return all(_fits(one, inner[0]) for one in value)
         if origin is Sequence or not several or inner[-1] is Ellipsis:
             return several
-        return isinstance(value, list | tuple) and len(value) == len(inner) and all(map(_fits, value, inner))
+        return (
+            isinstance(value, list | tuple)
+            and len(value) == len(inner)
+            and all(map(_fits, value, inner))
+        )
     if origin is Mapping:
         return isinstance(value, Mapping)
     if kind is bool:
         return isinstance(value, bool) or getattr(getattr(value, "dtype", None), "kind", "") == "b"
     if kind is int or kind is float:
-        number = isinstance(value, Integral if kind is int else Real) and not isinstance(value, bool)
+        number = isinstance(value, Integral if kind is int else Real) and not isinstance(
+            value, bool
+        )
         return number and not (kind is float and math.isnan(float(value)))
     if not isinstance(kind, type) or getattr(kind, "_is_protocol", False):
         return True

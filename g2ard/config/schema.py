@@ -85,7 +85,9 @@ class Settings:
             return self
         kind = self._variant(name)
         usual = type(self)(**{tag: getattr(self, tag)})
-        changed = {field: value for field, value in vars(self).items() if value != getattr(usual, field)}
+        changed = {
+            field: value for field, value in vars(self).items() if value != getattr(usual, field)
+        }
         kept = {field: value for field, value in changed.items() if field in _list_names(kind)}
         return kind(**{**kept, tag: name})
 
@@ -139,7 +141,9 @@ def keywords(function: Callable[..., Any], config: Any, given: Mapping[str, Any]
 
     A name that is neither an argument nor the end of a path of `config` is answered by the nearest of these.
     """
-    arguments = [name for name, p in signature(function).parameters.items() if p.kind is not p.VAR_KEYWORD]
+    arguments = [
+        name for name, p in signature(function).parameters.items() if p.kind is not p.VAR_KEYWORD
+    ]
     paths = {leaf.path for leaf in _list_leaves(config, every=True)}
     known = {*arguments, *(path.rpartition(".")[2] for path in paths)}
     for name in given:
@@ -318,8 +322,12 @@ def _parse(kind: Any, text: str) -> Any:
         text = text.strip("()[]")
         if kinds[-1] is Ellipsis:
             mark = ";" if get_origin(kinds[0]) is tuple else ","
-            return tuple(_parse(kinds[0], part.strip()) for part in text.split(mark) if part.strip())
-        return tuple(_parse(k, part.strip()) for k, part in zip(kinds, text.split(","), strict=True))
+            return tuple(
+                _parse(kinds[0], part.strip()) for part in text.split(mark) if part.strip()
+            )
+        return tuple(
+            _parse(k, part.strip()) for k, part in zip(kinds, text.split(","), strict=True)
+        )
     if kind is type(None) and text.lower() == "none":
         return None
     if kind is bool and text.lower() in ("true", "false"):

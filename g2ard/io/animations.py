@@ -24,7 +24,9 @@ def check_animation(path: Path) -> None:
     """Check that an animation of this suffix can be written."""
     if path.suffix.lower() == ".mp4" and shutil.which("ffmpeg") is None:
         raise MissingDependencyError(
-            "an .mp4 needs the program ffmpeg on PATH", path=path, hint="install it, or write .webp or .gif"
+            "an .mp4 needs the program ffmpeg on PATH",
+            path=path,
+            hint="install it, or write .webp or .gif",
         )
 
 
@@ -44,7 +46,12 @@ def write_animation(
             _encode(temporary, (first.shape[1], first.shape[0]), frames, fps)
             return
         image, *rest = [Image.fromarray(frame) for frame in frames]
-        options: dict[str, Any] = {"duration": 1000 / fps, "loop": 0, "quality": 80, "optimize": True}
+        options: dict[str, Any] = {
+            "duration": 1000 / fps,
+            "loop": 0,
+            "quality": 80,
+            "optimize": True,
+        }
         image.save(temporary, save_all=True, append_images=rest, **options)
 
 
@@ -60,7 +67,15 @@ def _encode(path: Path, size: Size, frames: Iterable[Bytes], fps: float) -> None
     """Pipe raw frames to ffmpeg; H.264 with 4:2:0 needs even sides, so odd ones lose a pixel."""
     command = ["ffmpeg", "-y", "-loglevel", "error", "-f", "rawvideo", "-pix_fmt", "rgb24"]
     command += ["-s", f"{size[0]}x{size[1]}", "-r", f"{fps:g}", "-i", "-"]
-    command += ["-vf", "crop=trunc(iw/2)*2:trunc(ih/2)*2", "-pix_fmt", "yuv420p", "-crf", "18", str(path)]
+    command += [
+        "-vf",
+        "crop=trunc(iw/2)*2:trunc(ih/2)*2",
+        "-pix_fmt",
+        "yuv420p",
+        "-crf",
+        "18",
+        str(path),
+    ]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE) as process:
         assert process.stdin is not None
         assert process.stderr is not None
@@ -72,4 +87,6 @@ def _encode(path: Path, size: Size, frames: Iterable[Bytes], fps: float) -> None
             pass
         said = process.stderr.read().decode(errors="replace").strip()
     if process.returncode:
-        raise InputError(f"ffmpeg failed: {said.splitlines()[-1] if said else process.returncode}", path=path)
+        raise InputError(
+            f"ffmpeg failed: {said.splitlines()[-1] if said else process.returncode}", path=path
+        )

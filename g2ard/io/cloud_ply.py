@@ -64,7 +64,9 @@ class Stream(PointStream):
         super().__init__(path, len(self._vertices), sample, widest)
         if not choices:
             found = f"(found {' '.join(header.properties('vertex'))})"
-            self.lack = "needs the vertex properties 'red', 'green', 'blue' of a coloured point cloud, or "
+            self.lack = (
+                "needs the vertex properties 'red', 'green', 'blue' of a coloured point cloud, or "
+            )
             self.lack += f"intensities {found}; rename its colours if they have other names"
         if not choices and is_mesh(header):
             self.lack = "is a mesh without colours at its vertices"
@@ -97,12 +99,16 @@ def _color(path: Path, values: Values, name: str) -> Float32:
     least = -0.5 if values.dtype.kind == "f" else 0
     if low < least or top > scales[-1] * 1.001:
         beyond = low if low < 0 else top
-        raise InputError(f"has a value of {beyond:g}, expected [0, {scales[-1]:g}]", path=path, property=name)
+        raise InputError(
+            f"has a value of {beyond:g}, expected [0, {scales[-1]:g}]", path=path, property=name
+        )
     with np.errstate(invalid="ignore"):  # a signalling NaN
         return values.astype(np.float32)
 
 
-def write_blocks(path: Path, count: int, blocks: Iterable[Points], *, overwrite: bool = False) -> None:
+def write_blocks(
+    path: Path, count: int, blocks: Iterable[Points], *, overwrite: bool = False
+) -> None:
     """Write a binary .ply of `count` points that arrive in blocks: float64 positions, 8-bit colours."""
     types = dict.fromkeys(_POSITION, "<f8") | dict.fromkeys(COLOR_NAMES[0], "u1")
 

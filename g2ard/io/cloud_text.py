@@ -51,18 +51,23 @@ class Stream(HeldPoints):
             packed = table[:, names.index("rgb")]
             whole = (packed == np.rint(packed)).all()
             colors = unpack_colors(packed.astype("<u4" if whole else "<f4"))
-            names[table.shape[1] : table.shape[1]] = ["red", "green", "blue"]  # before unread columns
+            # before unread columns
+            names[table.shape[1] : table.shape[1]] = ["red", "green", "blue"]
             table = np.column_stack([table, *colors])
         column = {name: names.index(name) for name in _COLUMNS if name in names}
         if missing := [name for name in "xyz" if name not in column]:
             raise InputError(f"has no column {missing[0]!r} (found {' '.join(names)})")
-        shades: tuple[str, ...] = next((names for names in _SHADES if set(names) <= set(column)), ())
+        shades: tuple[str, ...] = next(
+            (names for names in _SHADES if set(names) <= set(column)), ()
+        )
         positions = table[:, [column[axis] for axis in "xyz"]]
         values = table[:, [column[name] for name in shades]]
         columns = dict(zip(names, table.T, strict=False))
         super().__init__(path, positions, values, full_scales(np.dtype(float)), columns)
         if not shades:
-            self.lack = f"has no colours (found columns {' '.join(names)}); name them red, green and blue"
+            self.lack = (
+                f"has no colours (found columns {' '.join(names)}); name them red, green and blue"
+            )
 
 
 def check_points(path: Path) -> None:
@@ -125,7 +130,12 @@ def _names(heading: str) -> list[str]:
     mark = next((mark for mark in ";,\t" if mark in heading), None)
     plain = re.sub(r"\[.*?\]|\(.*?\)", "", heading.lower()).strip(" #/%")
     words = [word.strip(" #/%'").replace(" ", "_") for word in plain.split(mark)]
-    usual = {word: key for word in words for key, spelled in _COLUMNS.items() if re.fullmatch(spelled, word)}
+    usual = {
+        word: key
+        for word in words
+        for key, spelled in _COLUMNS.items()
+        if re.fullmatch(spelled, word)
+    }
     return [usual.get(word, word) for word in words]
 
 
@@ -156,7 +166,8 @@ def _unnamed(table: Float) -> list[str]:
         if varying:
             alike[start] = float(np.abs(np.corrcoef(values.T)).min())
     if found:
-        likest = max(alike.values())  # an intensity beside colours differs from them more than they do
+        # an intensity beside colours differs from them more than they do
+        likest = max(alike.values())
         if likest >= _ALIKE:
             found = [each for each in found if alike[each[-1]] > likest / 2]
         start = min(found, key=lambda each: each[:2])[-1]
@@ -183,7 +194,10 @@ def _pcd(path: Path) -> tuple[list[str], Float]:
         counts = head.get("COUNT") or "1" * len(fields)
         shapes = zip(head["TYPE"], head["SIZE"], counts, strict=True)
         rows = np.dtype(
-            [(f"{i}", f"<{kind.lower()}{size}", (int(n),)) for i, (kind, size, n) in enumerate(shapes)]
+            [
+                (f"{i}", f"<{kind.lower()}{size}", (int(n),))
+                for i, (kind, size, n) in enumerate(shapes)
+            ]
         )
         if how == "ascii":
             values = np.loadtxt(io.StringIO(plain_numbers(body.decode("latin-1"))), ndmin=2)
@@ -196,7 +210,9 @@ def _pcd(path: Path) -> tuple[list[str], Float]:
         elif how == "binary":
             table = np.frombuffer(body, rows, count)
         else:
-            hint = "`pcl_convert_pcd_ascii_binary IN.pcd OUT.pcd 1` unpacks it, with its colours (rgb)"
+            hint = (
+                "`pcl_convert_pcd_ascii_binary IN.pcd OUT.pcd 1` unpacks it, with its colours (rgb)"
+            )
             raise InputError(f"has the unsupported kind of data {how!r}", hint=hint)
     except InputError:
         raise

@@ -28,9 +28,24 @@ from g2ard.scene.lenses import PARAMETERS, PhotoLens
 from g2ard.scene.transform import quaternion_of
 
 _MODELS = (
-    *("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV"),
+    *(
+        "SIMPLE_PINHOLE",
+        "PINHOLE",
+        "SIMPLE_RADIAL",
+        "RADIAL",
+        "OPENCV",
+        "OPENCV_FISHEYE",
+        "FULL_OPENCV",
+    ),
     *("FOV", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "THIN_PRISM_FISHEYE"),
-    *("RAD_TAN_THIN_PRISM_FISHEYE", "SIMPLE_DIVISION", "DIVISION", "SIMPLE_FISHEYE", "FISHEYE", "EUCM"),
+    *(
+        "RAD_TAN_THIN_PRISM_FISHEYE",
+        "SIMPLE_DIVISION",
+        "DIVISION",
+        "SIMPLE_FISHEYE",
+        "FISHEYE",
+        "EUCM",
+    ),
     "EQUIRECTANGULAR",
 )
 """Names of models by their number in binary tables."""
@@ -173,9 +188,13 @@ def incomplete(path: Path) -> InputError | None:
         held = [name for name in _MODEL_FILES if name.lower() in names]
         if held and _tables(place) is None:
             suffix = Path(held[0]).suffix
-            lacking = [f"{part}{suffix}" for part in ("cameras", "images") if f"{part}{suffix}" not in held]
+            lacking = [
+                f"{part}{suffix}" for part in ("cameras", "images") if f"{part}{suffix}" not in held
+            ]
             text = f"COLMAP model without {' and '.join(lacking)}; found {', '.join(held)}"
-            return InputError(text, path=place, hint="copy the whole model: cameras (lenses), images (poses)")
+            return InputError(
+                text, path=place, hint="copy the whole model: cameras (lenses), images (poses)"
+            )
     return None
 
 
@@ -221,7 +240,9 @@ def listed(views: ViewFiles) -> Listed:
     tables = _tables(folder) if folder else None
     if folder is None or tables is None:
         error = incomplete(path)
-        raise error or InputError("has no COLMAP model (cameras and images, .bin or .txt)", path=path)
+        raise error or InputError(
+            "has no COLMAP model (cameras and images, .bin or .txt)", path=path
+        )
     with parsing(tables[0]):
         cameras = _cameras(open_table(tables[0], "camera"))
     with parsing(tables[1]):
@@ -483,7 +504,9 @@ def _camera(model: str, size: tuple[int, int], p: tuple[float, ...]) -> Lens:
     fx, fy, cx, cy, *k = p
     if min(size) < 1 or min(fx, fy) <= 0:
         width, height = size
-        raise InputError(f"invalid camera of {width:,}×{height:,} pixels and focal lengths {fx}, {fy}")
+        raise InputError(
+            f"invalid camera of {width:,}×{height:,} pixels and focal lengths {fx}, {fy}"
+        )
     distortion = (*k, 0.0, 0.0, 0.0, 0.0, 0.0)[:5]
     return Lens.pinhole(size, (fx, fy), (cx, cy), distortion)
 
@@ -581,7 +604,9 @@ def texts_of(cameras: Cameras) -> dict[str, str]:
         "images": "".join(images),
         "points3D": "",
     }
-    return {f"sparse/0/{name}.txt": f"# {columns}\n{rows[name]}" for name, columns in _WRITTEN.items()}
+    return {
+        f"sparse/0/{name}.txt": f"# {columns}\n{rows[name]}" for name, columns in _WRITTEN.items()
+    }
 
 
 _WRITTEN = {

@@ -64,7 +64,8 @@ class Stream(RawStream):
         header = read_header(path)
         require(header.properties("vertex"), _PACKED, "a compressed scene")
         chunk_properties = header.properties("chunk")
-        bounds = _BOUNDS if "min_r" in chunk_properties else _BOUNDS[:12]  # older files: colours over [0, 1]
+        # older files: colours over [0, 1]
+        bounds = _BOUNDS if "min_r" in chunk_properties else _BOUNDS[:12]
         require(chunk_properties, bounds, "a compressed scene", "chunk")
         rest = [p for p in header.properties("sh") if re.fullmatch(r"f_rest_\d+", p)]
         if len(rest) not in (0, 9, 24, 45) or set(rest) != set(_rest_names(len(rest))):

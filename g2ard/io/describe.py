@@ -130,7 +130,9 @@ def _views(views: ViewSet) -> Json:
         "count": len(cameras),
         "photos": sum(path is not None for path in cameras.image_paths),
         "sizes": dict(sizes.most_common()),
-        "fov_degrees": _quantiles(np.degrees(2 * np.arctan(cameras.widths / (2 * cameras.Ks[:, 0, 0])))),
+        "fov_degrees": _quantiles(
+            np.degrees(2 * np.arctan(cameras.widths / (2 * cameras.Ks[:, 0, 0])))
+        ),
         "distorted": int(cameras.distortions.any(1).sum()),
         "splits": dict(Counter(s for s in views.splits if s)),
         "extent": _extent(cameras.positions),

@@ -60,7 +60,10 @@ _FOLDERS: dict[str, tuple[str, ...] | None] = {
     "nerfstudio": ("dataparser_transforms.json",),  # before its data, which are in another world
     "colmap": None,
     "nerfstudio_export": None,
-    "transforms": ("transforms.json", *(f"transforms_{split}.json" for split in ("train", "val", "test"))),
+    "transforms": (
+        "transforms.json",
+        *(f"transforms_{split}.json" for split in ("train", "val", "test")),
+    ),
     "llff": ("poses_bounds.npy",),
     "polycam": None,
     "inria": ("cameras.json",),
@@ -81,7 +84,9 @@ _JSON: dict[str, tuple[type, set[str]]] = {
 """Formats of .json files of views: an object with these keys, or a list of such objects."""
 
 KINDS: dict[str, Kind] = {name: kind for kind, formats in READERS.items() for name in formats}
-_BY_NAME = {end: name for formats in READERS.values() for name, ends in formats.items() for end in ends}
+_BY_NAME = {
+    end: name for formats in READERS.values() for name, ends in formats.items() for end in ends
+}
 
 _NAMES: dict[Kind, str] = {
     "splats": "a Gaussian scene",
@@ -109,7 +114,8 @@ _BESIDE = (".lax", ".lasx", ".copc", ".prj", ".wkt", ".xml", ".txt", ".md", ".pd
 """Suffixes of files that surveys keep beside their clouds."""
 
 _MOST_INSPECTED_FILES = 64  # maximum files of a folder to inspect for suggestions
-_MOST_SEARCHED_FILES = 256  # maximum files of a folder and those below to look for signs of other programs
+# maximum files of a folder and those below to look for signs of other programs
+_MOST_SEARCHED_FILES = 256
 
 
 def suffixes(kind: Kind) -> str:
@@ -118,7 +124,9 @@ def suffixes(kind: Kind) -> str:
     >>> suffixes("splats")[:28]
     '.ply, .compressed.ply, .sog,'
     """
-    ends = (end for format_ends in READERS[kind].values() for end in format_ends if end.startswith("."))
+    ends = (
+        end for format_ends in READERS[kind].values() for end in format_ends if end.startswith(".")
+    )
     return ", ".join(ends)
 
 
@@ -216,7 +224,8 @@ def _check_content(path: Path) -> None:
         raise InputError(f"is {sign.what} in spite of its name", hint=hint)
 
 
-_PACKED = ("las", "usd")  # formats with suffixes of which each may hold what content tells as another of them
+# formats with suffixes of which each may hold what content tells as another of them
+_PACKED = ("las", "usd")
 
 
 def run_scene(path: AnyPath) -> Path:
@@ -420,7 +429,9 @@ def _unsupported(path: Path) -> str:
         with suppress(InputError):
             held[kind(file)].append(file.name)
     words = {"splats": "a scene", "points": "a point cloud", "views": "views"}
-    held_kinds = [f"{', '.join(names[:5])} ({words[what]})" for what, names in held.items() if names]
+    held_kinds = [
+        f"{', '.join(names[:5])} ({words[what]})" for what, names in held.items() if names
+    ]
     if held_kinds:
         return f"{_NO_FOLDER}; give one of its files: {', '.join(held_kinds)}"
     if runs := [folder.name for folder in sorted(path.iterdir()) if run_scene(folder) != folder]:
@@ -436,7 +447,9 @@ def _unsupported(path: Path) -> str:
             continue
         if (poses := _poses_above(path)) is not None:
             return f"holds photos alone; give {poses}, which has their poses"
-        unread = [what for file in photos[:_MOST_INSPECTED_FILES] if (what := describe_unreadable(file))]
+        unread = [
+            what for file in photos[:_MOST_INSPECTED_FILES] if (what := describe_unreadable(file))
+        ]
         first = f"convert its {unread[0]} photos to JPEG, then " if unread else ""
         return (
             f"holds photos without poses: {first}estimate them with `colmap automatic_reconstructor "
@@ -467,7 +480,9 @@ def _photos_in(folder: Path) -> list[Path]:
     if not folder.is_dir():
         return []
     held = sorted(folder.iterdir())
-    inner = (sorted(sub.iterdir()) for sub in islice(filter(Path.is_dir, held), _MOST_INSPECTED_FILES))
+    inner = (
+        sorted(sub.iterdir()) for sub in islice(filter(Path.is_dir, held), _MOST_INSPECTED_FILES)
+    )
     found = ([file for file in files if is_a_photo(file)] for files in (held, *inner))
     return next(filter(None, found), [])
 
@@ -509,5 +524,7 @@ def _json_format(path: Path) -> str:
     if name := json_format(content):
         return name
     if not isinstance(content, dict):
-        raise InputError("is a JSON list, but not cameras of INRIA's trainer or of nerfstudio's ns-export")
+        raise InputError(
+            "is a JSON list, but not cameras of INRIA's trainer or of nerfstudio's ns-export"
+        )
     raise InputError("is neither a transforms.json ('frames') nor g2ard's views ('views')")

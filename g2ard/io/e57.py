@@ -51,7 +51,11 @@ class Stream(JoinedClouds):
             counts = [header.point_count for header in headers]
             check_unpacked(path.stat().st_size, 24 * sum(counts))
             self._photos = sum(node.isDefined("pose") for node in _images(file))
-            scans = [_Scan(path, header, number) for number, header in enumerate(headers) if counts[number]]
+            scans = [
+                _Scan(path, header, number)
+                for number, header in enumerate(headers)
+                if counts[number]
+            ]
         if not scans:
             raise InputError("has no points")
         super().__init__(scans)
@@ -66,11 +70,15 @@ class Stream(JoinedClouds):
             for note in scan.header_notes():
                 found.setdefault(note.code, []).append(replace(note, text=f"{part}{note}"))
         notes = [
-            replace(same[0], count=sum(note.count for note in same), text=f"{same[0]}{_more(len(same))}")
+            replace(
+                same[0], count=sum(note.count for note in same), text=f"{same[0]}{_more(len(same))}"
+            )
             for same in found.values()
         ]
         if self._photos:
-            text = f"{plural(self._photos, 'photo')} with poses inside; --views {self.path} uses them"
+            text = (
+                f"{plural(self._photos, 'photo')} with poses inside; --views {self.path} uses them"
+            )
             notes.append(Note("photos", self._photos, text))
         return tuple(notes)
 
@@ -90,7 +98,9 @@ class _Scan(PointStream):
         self._number = number
         self.fields = tuple(header.point_fields)
         self._names = names = set(self.fields)
-        place = next((fields for fields in (_CARTESIAN, _SPHERICAL) if names.issuperset(fields)), None)
+        place = next(
+            (fields for fields in (_CARTESIAN, _SPHERICAL) if names.issuperset(fields)), None
+        )
         if place is None:
             what = "has no positions (cartesianX, cartesianY, cartesianZ)"
             raise InputError(what, index=number, item="scan")
@@ -139,7 +149,9 @@ class _Scan(PointStream):
             fields = {name: np.empty(rows) for name in names}
             buffers = libe57.VectorSourceDestBuffer()
             for name, values in fields.items():
-                buffers.append(libe57.SourceDestBuffer(file.image_file, name, values, rows, True, True))
+                buffers.append(
+                    libe57.SourceDestBuffer(file.image_file, name, values, rows, True, True)
+                )
             reader = file.get_header(self._number)["points"].reader(buffers)
             at = 0
             while got := reader.read():
@@ -259,7 +271,13 @@ def _frame(number: int, node: Any, folder: Path) -> Frame | str:
     else:
         focal, across, down, cx, cy = (
             float(shown[name].value())
-            for name in ("focalLength", "pixelWidth", "pixelHeight", "principalPointX", "principalPointY")
+            for name in (
+                "focalLength",
+                "pixelWidth",
+                "pixelHeight",
+                "principalPointX",
+                "principalPointY",
+            )
         )
         if not (focal > 0 and across > 0 and down > 0):
             return f"{stem} has no focal length"
@@ -273,7 +291,9 @@ def _frame(number: int, node: Any, folder: Path) -> Frame | str:
     else:
         mask = None
     world_from_camera = _pose(node["pose"]) @ (_PANORAMA_AXES if kind == "spherical" else FLIP)
-    return Frame(photo.name, invert_pose(world_from_camera), lens, photo, mask=mask, listed=photo.name)
+    return Frame(
+        photo.name, invert_pose(world_from_camera), lens, photo, mask=mask, listed=photo.name
+    )
 
 
 def _pose(node: Any) -> Float:

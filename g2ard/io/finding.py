@@ -78,7 +78,11 @@ class Finder:
 
     @classmethod
     def among(
-        cls, given: Path | None, names: Sequence[str], folders: Sequence[Path], around: Iterable[Path]
+        cls,
+        given: Path | None,
+        names: Sequence[str],
+        folders: Sequence[Path],
+        around: Iterable[Path],
     ) -> Finder:
         """Return the finder in the `given` folder, otherwise in `folders`, or if they hold none of the names,
         in the first folder that holds half of them: one of `around`, or a folder in these. A few like names
@@ -265,7 +269,9 @@ def photos_in(folder: Path, *, below: bool = False) -> list[Path]:
     else:
         files = files_in(folder)
     photos = [file for file in files if is_photo(file)]
-    masks = {photo.with_name(name) for photo in photos for name in _mask_names(photo, _MASKS_BESIDE)}
+    masks = {
+        photo.with_name(name) for photo in photos for name in _mask_names(photo, _MASKS_BESIDE)
+    }
     return [photo for photo in photos if photo.with_name(photo.stem) not in masks]
 
 

@@ -213,9 +213,7 @@ def make_view_set(listed: Listed) -> ViewSet:
     notes = []
     if left_out:
         name, fault = left_out[0]
-        text = (
-            f"{plural(len(left_out), 'view')} left out, which numbers that are not finite describe: {fault}"
-        )
+        text = f"{plural(len(left_out), 'view')} left out, which numbers that are not finite describe: {fault}"
         notes.append(Note("not_finite", len(left_out), f"{text} (view {name!r})"))
     frames, found_notes = _check_photos(frames)
     notes += found_notes
@@ -224,7 +222,9 @@ def make_view_set(listed: Listed) -> ViewSet:
         frames = [view for frame in frames for view in _split_into_pinholes(frame)]
         models = ", ".join(sorted({frame.lens.photo.model for frame in bent if frame.lens.photo}))
         made = sum(frame.lens.photo is not None for frame in frames)
-        text = f"{plural(len(bent), 'photo')} ({models}) resampled to {plural(made, 'pinhole view')}"
+        text = (
+            f"{plural(len(bent), 'photo')} ({models}) resampled to {plural(made, 'pinhole view')}"
+        )
         notes.append(Note("resampled", made, text))
     pictured = [frame for frame in frames if frame.photo is not None]
     present = [frame for frame in pictured if frame.photo and usable(frame.photo)]
@@ -238,7 +238,9 @@ def make_view_set(listed: Listed) -> ViewSet:
     cameras = replace(_stack_cameras(path, frames), source=path)
     masked = sum(mask is not None for mask in cameras.mask_paths)
     if masked:
-        notes.append(Note("masks", masked, f"{plural(masked, 'photo')} of {len(present)} have masks"))
+        notes.append(
+            Note("masks", masked, f"{plural(masked, 'photo')} of {len(present)} have masks")
+        )
     elif present and (folders := _find_idle_masks(present)):
         text = f"no mask in {folders[0]} is named like a photo, as {present[0].name}.png would be"
         notes.append(Note("unused_masks", 1, text))
@@ -345,4 +347,6 @@ def use_alpha_as_masks(found: ViewSet) -> ViewSet:
     pairs = zip(own, cameras.image_paths, cameras.mask_paths, strict=True)
     masks = tuple(photo if use else mask for use, photo, mask in pairs)
     text = f"{plural(sum(own), 'photo')} of {len(own)} masked by alpha"
-    return replace(found, cameras=replace(cameras, mask_paths=masks)).noted("alpha_masks", sum(own), text)
+    return replace(found, cameras=replace(cameras, mask_paths=masks)).noted(
+        "alpha_masks", sum(own), text
+    )

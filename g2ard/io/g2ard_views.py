@@ -115,7 +115,8 @@ def text_of(path: Path, cameras: Cameras, splits: Splits, weights: ArrayLike | N
     parts = list(splits) or [None] * count
     if len(parts) != count or len(drawn) != count:
         raise InputError(
-            f"{plural(count, 'view')}, {len(parts)} splits and {len(drawn)} weights do not match", path=path
+            f"{plural(count, 'view')}, {len(parts)} splits and {len(drawn)} weights do not match",
+            path=path,
         )
     lines = []
     for i in range(count):

@@ -68,7 +68,9 @@ _GLTF_TURN = np.array([-1.0, -1, 1])
 _SH_FLIPS = harmonic_signs(_GLTF_TURN)
 
 
-def write(path: Path, splats: Splats, *, overwrite: bool = False, compress: str | None = None) -> float:
+def write(
+    path: Path, splats: Splats, *, overwrite: bool = False, compress: str | None = None
+) -> float:
     """Write a .glb with KHR_gaussian_splatting; equal scenes give equal bytes.
 
     SCALE and OPACITY are linear, ROTATION is x y z w. COLOR_0 is for viewers that only draw points: the base
@@ -111,7 +113,9 @@ def _plain(splats: Splats) -> list[bytes]:
             accessor["normalized"] = True
         if name == "POSITION":
             accessor |= {end: getattr(values, end)(axis=0).tolist() for end in ("min", "max")}
-        views.append({"buffer": 0, "byteOffset": start, "byteLength": values.nbytes, "target": 34962})
+        views.append(
+            {"buffer": 0, "byteOffset": start, "byteLength": values.nbytes, "target": 34962}
+        )
         accessors.append(accessor)
         blobs.append(blob)
         start += len(blob)
@@ -171,7 +175,10 @@ def _about_y(splats: Splats) -> Splats:
     signs = harmonic_signs((-1, 1, -1))[: splats.shN.shape[1], None]
     means = splats.means * np.array([-1, 1, -1], splats.means.dtype)
     return replace(
-        splats, means=means, quats=splats.quats * np.array([1, -1, 1, -1], np.float32), shN=splats.shN * signs
+        splats,
+        means=means,
+        quats=splats.quats * np.array([1, -1, 1, -1], np.float32),
+        shN=splats.shN * signs,
     )
 
 
@@ -217,7 +224,9 @@ def _harmonics(degree: int) -> list[tuple[str, int]]:
     ]
 
 
-def _document(node: Json, names: list[str], views: list[Any], accessors: list[Any], size: int) -> Json:
+def _document(
+    node: Json, names: list[str], views: list[Any], accessors: list[Any], size: int
+) -> Json:
     from g2ard._core import __version__
 
     splatting: Json = {
@@ -356,7 +365,9 @@ def _with_buffer(path: Path, document: Any) -> tuple[Any, bytes]:
 
 def _scene(path: Path, document: _Document, binary: bytes) -> Noted:
     """Read all splat primitives, each as often as nodes show it."""
-    others = sum(not _has_splats(primitive) for mesh in document.meshes for primitive in mesh.primitives)
+    others = sum(
+        not _has_splats(primitive) for mesh in document.meshes for primitive in mesh.primitives
+    )
     found = placed(_shown(path, document, binary))
     if found is None:
         modes = {primitive.mode for mesh in document.meshes for primitive in mesh.primitives}
@@ -412,7 +423,9 @@ def placed(parts: Iterable[tuple[Noted, Float]]) -> Noted | None:
         moved.append(splats)
         uneven += not exact
     if uneven:
-        text = f"{plural(uneven, 'part')} scaled unevenly: colours by direction follow approximately"
+        text = (
+            f"{plural(uneven, 'part')} scaled unevenly: colours by direction follow approximately"
+        )
         notes.append(Note("uneven_placement", uneven, text))
     if not moved:
         return None
@@ -453,7 +466,12 @@ def _attributes_of(place: Place, document: _Document, binary: bytes, names: Json
         if name not in names:
             raise InputError(f"attribute {name!r} is missing", path=place.path)
         return _accessor(
-            place.to(name), document, binary, checked(names[name], Whole, place.to(name)), name, width
+            place.to(name),
+            document,
+            binary,
+            checked(names[name], Whole, place.to(name)),
+            name,
+            width,
         )
 
     own = list(names)
@@ -500,14 +518,18 @@ def _view(document: _Document, index: int | None, place: Place, what: str) -> _V
     return view
 
 
-def _accessor(place: Place, document: _Document, binary: bytes, index: int, name: str, width: int) -> Float32:
+def _accessor(
+    place: Place, document: _Document, binary: bytes, index: int, name: str, width: int
+) -> Float32:
     """Return the (count, width) values of an accessor; normalised integers become fractions."""
     path = place.path
     accessor = _entry(document.accessors, index, place)
     dtype = np.dtype(_DTYPES.get(accessor.component_type, "V1"))
     if dtype.kind == "V" or _TYPES.get(accessor.type) != width or accessor.sparse is not None:
         raise InputError(f"attribute {name!r} has an unsupported type")
-    view = _view(document, accessor.buffer_view, Place(path).to("accessors", index), f"attribute {name!r}")
+    view = _view(
+        document, accessor.buffer_view, Place(path).to("accessors", index), f"attribute {name!r}"
+    )
     row = width * dtype.itemsize
     step = row if view.byte_stride is None else view.byte_stride
     start = view.byte_offset + accessor.byte_offset
@@ -537,7 +559,9 @@ def _nodes_shown(path: Path, document: _Document) -> set[int]:
             ahead += _entry(document.nodes, at, place).children
             found.add(int(at))
     for index, mesh in enumerate(document.meshes):
-        if any(map(_has_splats, mesh.primitives)) and any(document.nodes[at].mesh == index for at in found):
+        if any(map(_has_splats, mesh.primitives)) and any(
+            document.nodes[at].mesh == index for at in found
+        ):
             return found
     return every
 

@@ -49,7 +49,9 @@ def read(views: ViewFiles) -> Listed:
     data = data_of(file)
     if named is None or data is None:
         text = f"data_dir {named and named.as_posix()} does not exist"
-        raise InputError(text, path=file, hint="give its COLMAP folder as views, or correct data_dir")
+        raise InputError(
+            text, path=file, hint="give its COLMAP folder as views, or correct data_dir"
+        )
     smaller = data / f"images_{settings.word('data_factor')}"
     photos = views.images or (smaller if smaller.is_dir() else None)
     try:
@@ -59,8 +61,13 @@ def read(views: ViewFiles) -> Listed:
         raise InputError(f"data_dir: {error}", path=file) from error
     every = settings.word("test_every") or "8"
     if not every.isdigit() or int(every) < 1:
-        raise InputError(f"is {every!r}, expected a whole number ≥ 1", path=file, property="test_every")
-    frames = [frame._replace(split="train" if i % int(every) else "test") for i, frame in enumerate(frames)]
+        raise InputError(
+            f"is {every!r}, expected a whole number ≥ 1", path=file, property="test_every"
+        )
+    frames = [
+        frame._replace(split="train" if i % int(every) else "test")
+        for i, frame in enumerate(frames)
+    ]
     text = "the run optimised its poses; these are the poses before training"
     return Listed(found.path, frames).noted(
         "optimised_poses", len(frames) * (settings.word("pose_opt") == "true"), text

@@ -85,5 +85,7 @@ def write_png(path: str | Path, image: ArrayLike, *, overwrite: bool = False) ->
 def png_bytes(image: ArrayLike) -> bytes:
     """Return an image, as `write_png` takes it, as the content of a PNG file."""
     content = BytesIO()
-    Image.fromarray(np.ascontiguousarray(to_bytes(image))).save(content, format="PNG", compress_level=3)
+    Image.fromarray(np.ascontiguousarray(to_bytes(image))).save(
+        content, format="PNG", compress_level=3
+    )
     return content.getvalue()

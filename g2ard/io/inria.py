@@ -51,7 +51,9 @@ def read(views: ViewFiles) -> Listed:
             frame = frame._replace(name=f"{frame.name}_{number}")
         frames.append(frame)
     repeated = sum(count for count in times.values() if count > 1)
-    text = f"{plural(repeated, 'camera')} of {len(frames)} have repeated names; their ids are appended"
+    text = (
+        f"{plural(repeated, 'camera')} of {len(frames)} have repeated names; their ids are appended"
+    )
     return Listed(file, frames, notes=among.notes).noted("repeated_names", repeated, text)
 
 

@@ -67,7 +67,11 @@ class Place:
 
     def error(self, message: str) -> InputError:
         return InputError(
-            message, path=self.path, property=self.property or None, index=self.index, item=self.item
+            message,
+            path=self.path,
+            property=self.property or None,
+            index=self.index,
+            item=self.item,
         )
 
 
@@ -82,7 +86,9 @@ def read_own(path: Path, format: str, version: int) -> Json:
     if content.get("format") != format:
         raise Place(path).to("format").error(f"is {content.get('format')!r}, expected {format!r}")
     if content.get("version") != version:
-        raise InputError(f"unsupported version {content.get('version')!r}; expected {version}", path=path)
+        raise InputError(
+            f"unsupported version {content.get('version')!r}; expected {version}", path=path
+        )
     return content
 
 

@@ -162,7 +162,9 @@ def judge_storage(
         if solid > 1:
             opaque = choose_white(opacities[:, None], full_scales(opacities.dtype))
         if opaque > 1:
-            notes.append(Note("opacities", count, f"opacities are whole numbers, taken as 0 to {opaque:g}"))
+            notes.append(
+                Note("opacities", count, f"opacities are whole numbers, taken as 0 to {opaque:g}")
+            )
     elif not logs and (faint < -_OUTSIDE or solid > 1 + _OUTSIDE):
         opaque = None
         notes.append(Note("opacities", count, "opacities leave [0, 1], so all are taken as logits"))
@@ -175,18 +177,26 @@ def judge_storage(
     unequal = small < large or math.exp(min(small, 1)) > _WIDE * apart
     if not logs and small < 0:
         log_scales = True
-        notes.append(Note("log_scales", count, "scales are below 0, so all are taken as logarithms"))
-    elif logs and enough and small > 0 and np.mean(scales, where=np.isfinite(scales)) < 1 and unequal:
+        notes.append(
+            Note("log_scales", count, "scales are below 0, so all are taken as logarithms")
+        )
+    elif (
+        logs and enough and small > 0 and np.mean(scales, where=np.isfinite(scales)) < 1 and unequal
+    ):
         told.insert(0, f"scales ({small:.3g} to {large:.3g}) look linear, not logarithms")
     dark, bright = bulk_range(base)
     full = None
     if dark >= 0 and bright > 1 and _are_whole(base):
         full = choose_white(base, full_scales(base.dtype))
-        notes.append(Note("base_colors", count, f"base colours are whole numbers, taken as 0 to {full:g}"))
+        notes.append(
+            Note("base_colors", count, f"base colours are whole numbers, taken as 0 to {full:g}")
+        )
     elif enough and 0 <= dark < bright - 0.5 and bright <= 1:
         told.append(f"base colours ({dark:.3g} to {bright:.3g}) look like RGB, not coefficients")
     if told:
-        notes.append(Note("activated", 1, f"{' and '.join(told)}; they are read as the format defines them"))
+        notes.append(
+            Note("activated", 1, f"{' and '.join(told)}; they are read as the format defines them")
+        )
     return Reading(log_scales, opaque, full, tuple(notes))
 
 

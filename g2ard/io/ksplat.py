@@ -21,11 +21,14 @@ _SECTION = np.dtype(
 """Header of a section."""
 
 _SH_COUNTS = {0: 0, 1: 9, 2: 24, 3: 45}
-_SH_ORDER = np.concatenate([np.arange(a, b).reshape(3, -1).T.ravel() for a, b in ((0, 9), (9, 24), (24, 45))])
+_SH_ORDER = np.concatenate(
+    [np.arange(a, b).reshape(3, -1).T.ravel() for a, b in ((0, 9), (9, 24), (24, 45))]
+)
 """Columns of harmonics, which are stored channel after channel per band, in the order of `Splats`."""
 
 _SH_RANGE = (-1.5, 1.5)  # range of 8-bit harmonics if the header gives none
-_SCALE_RANGE = 32767  # half of the steps of a 16-bit position within its bucket, if a section gives none
+# half of the steps of a 16-bit position within its bucket, if a section gives none
+_SCALE_RANGE = 32767
 
 
 def read(path: Path) -> Noted:
@@ -46,7 +49,9 @@ def read(path: Path) -> Noted:
     sections = int(words[1])
     if level not in (0, 1, 2):
         raise InputError(f"unsupported compression level {level}; expected 0, 1 or 2")
-    limits = tuple(float(given) or usual for given, usual in zip(floats[9:11], _SH_RANGE, strict=True))
+    limits = tuple(
+        float(given) or usual for given, usual in zip(floats[9:11], _SH_RANGE, strict=True)
+    )
     at = _HEADER + sections * _SECTION.itemsize
     if len(data) < at:
         raise damaged(f"is cut off within the headers of {sections} sections")
@@ -107,7 +112,9 @@ def _rows(
 
 def _centres(data: bytes, i: int, at: int, section: dict[str, Any], steps: Values) -> Float:
     """Return positions from 16-bit steps: full buckets first, then partial ones of the listed lengths."""
-    full, partial, buckets, size = (section[k] for k in ("full", "partial", "buckets", "bucket_bytes"))
+    full, partial, buckets, size = (
+        section[k] for k in ("full", "partial", "buckets", "bucket_bytes")
+    )
     if size < 12 or full + partial != buckets:
         raise damaged("has inconsistent buckets", index=i, item="section")
     lengths = np.frombuffer(data, "<u4", partial, at).astype(np.int64)

@@ -41,9 +41,13 @@ class Stream(PointStream):
             count = reader.header.point_count
             header = reader.header
             self.fields = tuple(header.point_format.dimension_names)
-            choices = [names for names in (_RGB, ("intensity",)) if {*self.fields}.issuperset(names)]
+            choices = [
+                names for names in (_RGB, ("intensity",)) if {*self.fields}.issuperset(names)
+            ]
             runs = []
-            for first in sorted({count * part // _SAMPLES for part in range(_SAMPLES)}) if count else []:
+            for first in (
+                sorted({count * part // _SAMPLES for part in range(_SAMPLES)}) if count else []
+            ):
                 reader.seek(first)
                 runs.append(reader.read_points(min(_SAMPLE_ROWS, count - first)))
             text = f"the header states 0 points; {count:,} follow, and are read"
@@ -60,9 +64,7 @@ class Stream(PointStream):
         self.metres_per_unit = metres_per_unit
         if choices[0] != _RGB:
             number = header.point_format.id
-            self.lack = (
-                f"point format {number} has no colours ('red', 'green', 'blue'), and intensities are equal"
-            )
+            self.lack = f"point format {number} has no colours ('red', 'green', 'blue'), and intensities are equal"
 
     def raw(self, rows: int, start: int) -> Iterator[MarkedPoints]:
         with _opened(self.path) as reader:
@@ -84,7 +86,8 @@ def _points(las: Any, color: Names) -> MarkedPoints:
     return positions, values, noise
 
 
-_UNITS = {9001: 1.0, 9002: 0.3048, 9003: 1200 / 3937}  # code of a unit of length in GeoTIFF keys → its metres
+# code of a unit of length in GeoTIFF keys → its metres
+_UNITS = {9001: 1.0, 9002: 0.3048, 9003: 1200 / 3937}
 
 
 def _map_of(header: Any) -> tuple[str | None, float | None]:
@@ -94,10 +97,14 @@ def _map_of(header: Any) -> tuple[str | None, float | None]:
     for record in header.vlrs:
         if record.record_id == 34735 and hasattr(record, "geo_keys"):
             codes = {key.id: key.value_offset for key in record.geo_keys}
-            systems += [f"EPSG:{codes[key]}" for key in (3072, 2048) if 0 < codes.get(key, 0) < 32767]
+            systems += [
+                f"EPSG:{codes[key]}" for key in (3072, 2048) if 0 < codes.get(key, 0) < 32767
+            ]
             units += [_UNITS[codes[3076]]] if codes.get(3076) in _UNITS else []
         if record.record_id == 2112 and hasattr(record, "string"):
-            for name, rest in re.findall(r'PROJ(?:CS|CRS)\["([^"]+)"(.*)', record.string, re.DOTALL):
+            for name, rest in re.findall(
+                r'PROJ(?:CS|CRS)\["([^"]+)"(.*)', record.string, re.DOTALL
+            ):
                 own = re.split(r"VERT_?C(?:S|RS)\[", rest)[0]
                 code = re.search(r'(?:AUTHORITY|ID)\["EPSG",\s*"?(\d+)"?\][\]\s,\0]*$', own)
                 systems.append(f"EPSG:{code[1]}" if code else name)
@@ -128,10 +135,14 @@ def _opened(path: Path) -> Iterator[Any]:
                 yield reader
         except (InputError, GeneratorExit):
             raise
-        except BaseException as error:  # laspy raises any exception for damaged files, and lazrs may panic
+        except (
+            BaseException
+        ) as error:  # laspy raises any exception for damaged files, and lazrs may panic
             if not isinstance(error, Exception) and type(error).__name__ != "PanicException":
                 raise
-            raise InputError(f"cannot be read as LAS: {str(error) or type(error).__name__}") from error
+            raise InputError(
+                f"cannot be read as LAS: {str(error) or type(error).__name__}"
+            ) from error
 
 
 def _number(path: Path, at: int, kind: str) -> Any:

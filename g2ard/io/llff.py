@@ -33,14 +33,18 @@ def read(views: ViewFiles) -> Listed:
             file, mmap_mode="r", allow_pickle=False
         )  # mapped: a header cannot claim more than there is
     except Exception as error:  # numpy raises any exception for damaged headers
-        raise damaged(f"is not a NumPy array ({' '.join(str(error).split())})", path=file) from error
+        raise damaged(
+            f"is not a NumPy array ({' '.join(str(error).split())})", path=file
+        ) from error
     if rows.ndim != 2 or rows.shape[1] not in (15, 17) or rows.dtype.kind != "f" or not len(rows):
         shape = "×".join(map(str, rows.shape))
         raise InputError(f"holds {shape} values of {rows.dtype}, expected N×17 numbers", path=file)
     photos = _photos(replace(views, path=file.parent))
     if photos and len(photos) != len(rows):
         text = f"has {plural(len(rows), 'pose')} for {plural(len(photos), 'photo')} in {photos[0].parent}"
-        raise InputError(text, path=file, hint="{images=DIR} names the folder with one photo per pose")
+        raise InputError(
+            text, path=file, hint="{images=DIR} names the folder with one photo per pose"
+        )
     frames = []
     for i, row in enumerate(rows.astype(float)):
         matrix = row[:15].reshape(3, 5)

@@ -34,7 +34,8 @@ else:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
 
     def _release(path: Path, file: int) -> None:
-        path.unlink(missing_ok=True)  # before releasing, so that waiting processes see that it is gone
+        # before releasing, so that waiting processes see that it is gone
+        path.unlink(missing_ok=True)
         os.close(file)
 
 

@@ -82,7 +82,11 @@ def _data(views: ViewFiles, settings: Settings | None) -> tuple[Sequence[Frame],
     if parser == "ColmapDataParser":
         model = place / (options.path("colmap_path") or "colmap/sparse/0")
         photos = views.images or place / (options.path("images_path") or "images")
-        return colmap.listed(ViewFiles(model, photos if photos.is_dir() else None)).whole(), _EYE, 1.0
+        return (
+            colmap.listed(ViewFiles(model, photos if photos.is_dir() else None)).whole(),
+            _EYE,
+            1.0,
+        )
     return _saved(replace(views, path=place), options if parser == "NerfstudioDataParser" else None)
 
 
@@ -93,7 +97,9 @@ def _parser(path: Path, settings: Settings) -> tuple[str, Settings, Path]:
         raise InputError("is missing", path=path, property="pipeline.datamanager.dataparser")
     name = parser[0].rsplit(".", 1)[-1].removesuffix("Config")
     if name not in _PARSERS:
-        raise InputError(f"unsupported data parser {name!r}; expected {', '.join(_PARSERS)}", path=path)
+        raise InputError(
+            f"unsupported data parser {name!r}; expected {', '.join(_PARSERS)}", path=path
+        )
     data = settings.path("data") or manager[1].path("data") or parser[1].path("data")
     if data is None:
         raise InputError("is missing", path=path, property="data")

@@ -46,7 +46,8 @@ def read(views: ViewFiles) -> Listed:
     for file in files:
         listed = checked(read_any_json(file), list[_Camera], Place(file), entries="camera")
         frames += [
-            _frame(Place(file, i, "camera"), camera, finder, lenses) for i, camera in enumerate(listed)
+            _frame(Place(file, i, "camera"), camera, finder, lenses)
+            for i, camera in enumerate(listed)
         ]
     return Listed(path, frames)
 
@@ -71,7 +72,9 @@ def _frame(
     )
 
 
-def _lens(listed: Place, named: Path, place: Path | None, known: dict[Path, dict[str, Lens]]) -> Lens:
+def _lens(
+    listed: Place, named: Path, place: Path | None, known: dict[Path, dict[str, Lens]]
+) -> Lens:
     """Return a photo's intrinsics by file name, from the nearest folder above it that has them."""
     for folder in () if place is None else (place, *place.parents[:3]):
         if folder not in known:
@@ -94,5 +97,7 @@ def _lenses(folder: Path) -> dict[str, Lens]:
         return {}
     names = [Path(frame.photo.name if frame.photo else frame.name).name for frame in frames]
     if len(set(names)) < len(names):
-        raise InputError("several photos have the same name, so their intrinsics are ambiguous", path=folder)
+        raise InputError(
+            "several photos have the same name, so their intrinsics are ambiguous", path=folder
+        )
     return {name: frame.lens for name, frame in zip(names, frames, strict=True)}

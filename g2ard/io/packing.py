@@ -12,7 +12,8 @@ from g2ard.scene.splats import Splats
 from g2ard.scene.transform import as_stored, moved_axes
 
 _MORTON_BITS = 21
-_NEAR = 4.0  # distance of near rows from the median, as a multiple of the 75th percentile of all distances
+# distance of near rows from the median, as a multiple of the 75th percentile of all distances
+_NEAR = 4.0
 
 FAR_FROM_ORIGIN = 32_752.0
 """Distance of a scene's middle from the origin beyond which half floats may overflow: half their largest."""

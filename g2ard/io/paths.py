@@ -16,10 +16,12 @@ from g2ard.errors import G2ardError, InputError
 
 AnyPath = str | Path
 
-_LONGEST_NAME = 200  # longest file name, bytes; systems allow 255, including suffixes and temporary names
+# longest file name, bytes; systems allow 255, including suffixes and temporary names
+_LONGEST_NAME = 200
 
 _LARGEST_RATIO = 100
-_ALWAYS_UNPACKED = 64 << 20  # bytes that any file may unpack to; larger ones are limited by `_LARGEST_RATIO`
+# bytes that any file may unpack to; larger ones are limited by `_LARGEST_RATIO`
+_ALWAYS_UNPACKED = 64 << 20
 
 
 def real_path(path: AnyPath) -> Path:
@@ -52,7 +54,9 @@ def check_unpacked(packed: int, unpacked: int, path: Path | None = None) -> None
     """Raise an `InputError` for data that unpacks to over 64 MiB and over 100 times its size, in bytes."""
     most = max(_ALWAYS_UNPACKED, _LARGEST_RATIO * packed)
     if unpacked > most:
-        raise InputError(f"{packed:,} bytes would unpack to {unpacked:,}; the limit is {most:,}", path=path)
+        raise InputError(
+            f"{packed:,} bytes would unpack to {unpacked:,}; the limit is {most:,}", path=path
+        )
 
 
 @contextmanager
@@ -90,7 +94,9 @@ def decoded(data: bytes) -> str:
     """
     wide = data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
     try:
-        text = data.decode("utf-16" if wide else "utf-8-sig", "strict" if wide else "surrogateescape")
+        text = data.decode(
+            "utf-16" if wide else "utf-8-sig", "strict" if wide else "surrogateescape"
+        )
     except UnicodeDecodeError as error:
         raise InputError("not a text file") from error
     if "\0" in text:
@@ -108,7 +114,9 @@ def plain_numbers(text: str) -> str:
     """
     sample = text[:_SAMPLE]
     decimal = (
-        re.search(r"\d,\d", sample) and not re.search(r"\d\.\d", sample) and re.search(r"\d[;\t ]", sample)
+        re.search(r"\d,\d", sample)
+        and not re.search(r"\d\.\d", sample)
+        and re.search(r"\d[;\t ]", sample)
     )
     if decimal:
         text = re.sub(r"(?<=\d),(?=\d)", ".", text)
@@ -134,18 +142,28 @@ def output_names(path: AnyPath, names: Sequence[str]) -> list[str]:
     """
     resolved = [_inside(path, i, name) for i, name in enumerate(names)]
     stems = Counter(path.with_suffix("") for path in resolved)
-    places = [path if stems[path.with_suffix("")] > 1 else path.with_suffix("") for path in resolved]
+    places = [
+        path if stems[path.with_suffix("")] > 1 else path.with_suffix("") for path in resolved
+    ]
     times = Counter(places)
     for name, place in zip(names, places, strict=True):
         if times[place] > 1:
-            raise InputError(f"{name!r} and another view would both be written as {str(place)!r}", path=path)
+            raise InputError(
+                f"{name!r} and another view would both be written as {str(place)!r}", path=path
+            )
     return [str(place) for place in places]
 
 
 def _inside(path: AnyPath, i: int, name: str) -> PurePosixPath:
     parts = PurePosixPath(PureWindowsPath(name.replace("\0", "")).as_posix()).parts
-    kept = [part for part in parts if part not in ("..", "/", "//") and not part.endswith((":", ":/"))]
-    if not kept or "\0" in name or max(len(part.encode(errors="replace")) for part in kept) > _LONGEST_NAME:
+    kept = [
+        part for part in parts if part not in ("..", "/", "//") and not part.endswith((":", ":/"))
+    ]
+    if (
+        not kept
+        or "\0" in name
+        or max(len(part.encode(errors="replace")) for part in kept) > _LONGEST_NAME
+    ):
         if len(name) <= _LONGEST_NAME:
             short = name
         else:

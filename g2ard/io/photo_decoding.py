@@ -33,7 +33,8 @@ def decode_photo(path: Path, like: Size | None = None) -> Float32:
             words = _read_words(path, image, upright)
             white = _choose_white(path.parent, path.suffix, int(words[..., :3].max()))
             values = words / white
-            if words.shape[2] == 4 and words[..., 3].max() > white:  # alpha may have more bits than colours
+            # alpha may have more bits than colours
+            if words.shape[2] == 4 and words[..., 3].max() > white:
                 values[..., 3] = words[..., 3] / 65535
         else:
             values = np.asarray(_convert_to_srgb(image), np.float32) / np.float32(255)
@@ -48,7 +49,9 @@ def decode_photo(path: Path, like: Size | None = None) -> Float32:
 
 def _is_deep(image: Image.Image) -> bool:
     """Return whether an image that is not decoded yet has 16 bits per channel, and no colour profile."""
-    return image.mode.startswith("I") or (bool(_raw_mode(image)) and not image.info.get("icc_profile"))
+    return image.mode.startswith("I") or (
+        bool(_raw_mode(image)) and not image.info.get("icc_profile")
+    )
 
 
 def _raw_mode(image: Any) -> str:
@@ -125,5 +128,7 @@ def _make_conversion(profile: bytes | None, mode: str) -> ImageCms.ImageCmsTrans
         if "srgb" not in ImageCms.getProfileDescription(own).lower():
             goal = "RGBA" if mode == "RGBA" else "RGB"
             colorimetric = ImageCms.Intent.RELATIVE_COLORIMETRIC
-            return ImageCms.buildTransform(own, ImageCms.createProfile("sRGB"), mode, goal, colorimetric)
+            return ImageCms.buildTransform(
+                own, ImageCms.createProfile("sRGB"), mode, goal, colorimetric
+            )
     return None

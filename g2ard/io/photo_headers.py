@@ -28,7 +28,8 @@ _FILM_FOCAL = 0xA405  # tag of the equivalent focal length on 35 mm film, in mm
 _SENSOR_PIXELS = 0xA20E  # tag of the sensor's pixels per unit
 _SENSOR_UNIT = 0xA210  # tag of that unit
 _STORED_WIDTH = 0xA002  # tag of the photo's width in pixels
-_UNITS = {2: 25.4, 3: 10.0, 4: 1.0, 5: 1e-3}  # millimetres of a unit of sensor pixels: inch, cm, mm and µm
+# millimetres of a unit of sensor pixels: inch, cm, mm and µm
+_UNITS = {2: 25.4, 3: 10.0, 4: 1.0, 5: 1e-3}
 _FILM_DIAGONAL = math.hypot(36, 24)  # diagonal of 35 mm film, mm
 
 
@@ -62,10 +63,10 @@ def open_image(path: Path, content: IO[bytes] | None = None) -> Iterator[Image.I
 
 
 _TIFF = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
-_OTHER_TIFF = "is a TIFF of pixels that cannot be read, such as floats, or other bands than red, green, blue"
-_CONVERT_TIFF = (
-    "`gdal_translate -b 1 -b 2 -b 3 -ot Byte -scale IN.tif OUT.png` converts it, if these are its bands"
+_OTHER_TIFF = (
+    "is a TIFF of pixels that cannot be read, such as floats, or other bands than red, green, blue"
 )
+_CONVERT_TIFF = "`gdal_translate -b 1 -b 2 -b 3 -ot Byte -scale IN.tif OUT.png` converts it, if these are its bands"
 
 
 def _begins_with(path: Path, starts: tuple[bytes, ...]) -> bool:
@@ -75,7 +76,9 @@ def _begins_with(path: Path, starts: tuple[bytes, ...]) -> bool:
     return False
 
 
-def read_size(path: Path, listed_in: Path | None = None, like: tuple[float, float] | None = None) -> Size:
+def read_size(
+    path: Path, listed_in: Path | None = None, like: tuple[float, float] | None = None
+) -> Size:
     """Read width and height from a photo's header, upright by EXIF if only that fits the size `like`."""
     try:
         with open_image(path) as image:
@@ -83,7 +86,9 @@ def read_size(path: Path, listed_in: Path | None = None, like: tuple[float, floa
                 return swap_sides(image.size)
             return image.size
     except InputError as error:
-        raise error if listed_in is None else error.at(hint=f"it is listed in {listed_in}") from None
+        raise (
+            error if listed_in is None else error.at(hint=f"it is listed in {listed_in}")
+        ) from None
 
 
 def swap_sides(size: Size) -> Size:
@@ -132,7 +137,9 @@ def read_focal(path: Path) -> float | None:
         film = float(tags.get(_FILM_FOCAL, 0))
         found = film * math.hypot(*size) / _FILM_DIAGONAL
         if not film:
-            per_mm = float(tags.get(_SENSOR_PIXELS, 0)) / _UNITS.get(tags.get(_SENSOR_UNIT, 2), 25.4)
+            per_mm = float(tags.get(_SENSOR_PIXELS, 0)) / _UNITS.get(
+                tags.get(_SENSOR_UNIT, 2), 25.4
+            )
             resized = size[0] / float(tags.get(_STORED_WIDTH, size[0]))
             found = float(tags.get(_FOCAL, 0)) * per_mm * resized
         if 0.1 < found / max(size) < 100:

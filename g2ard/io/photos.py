@@ -57,7 +57,9 @@ def _load_image(cameras: Cameras, index: int) -> Float32:
     path = cameras.image_paths[index]
     name = cameras.names[index]
     if path is None:
-        raise InputError(f"({name}) has no photo", index=index, item="view", hint="pass views with photos")
+        raise InputError(
+            f"({name}) has no photo", index=index, item="view", hint="pass views with photos"
+        )
     if cameras.source is None:
         named = None
     else:
@@ -131,7 +133,9 @@ def measure_traits(files: Sequence[Path]) -> PhotoTraits:
         alpha = 0
     if alpha or not shown:
         return PhotoTraits(alpha, None, sizes)
-    sides = [side[:, :3] for image in shown for side in (image[0], image[-1], image[:, 0], image[:, -1])]
+    sides = [
+        side[:, :3] for image in shown for side in (image[0], image[-1], image[:, 0], image[:, -1])
+    ]
     border = np.concatenate(sides)
     colour = np.median(border, axis=0)
     away = np.abs(border - colour).max(1)
@@ -272,7 +276,9 @@ def _look_up(lens: PhotoLens, K: Float, size: Size, times: int) -> tuple[Float, 
     return keep(lens, tuple(K.ravel()), size, times)
 
 
-def _find_pixels(lens: PhotoLens, K: tuple[float, ...], size: Size, times: int) -> tuple[Float, Mask]:
+def _find_pixels(
+    lens: PhotoLens, K: tuple[float, ...], size: Size, times: int
+) -> tuple[Float, Mask]:
     turn = np.linalg.inv(np.array(K).reshape(3, 3)).T
     across, down = ((np.arange(side * times) + 0.5) / times for side in size)
     bands = []

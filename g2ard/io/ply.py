@@ -65,7 +65,9 @@ class Stream(RawStream):
         self._quats = [] if round_ones else _QUATS
         needed = [*_MEANS, *(self._rgb or _DC), "opacity", *self._scales, *self._quats]
         plyfiles.require(list(names), needed, "a 3DGS scene")
-        rest = sorted((p for p in names if re.fullmatch(r"f_rest_\d{1,3}", p)), key=lambda p: int(p[7:]))
+        rest = sorted(
+            (p for p in names if re.fullmatch(r"f_rest_\d{1,3}", p)), key=lambda p: int(p[7:])
+        )
         stored, kept = _bands(rest)
         rows = _joined(plyfiles.read_element(path, header, *groups))
         self._names = names
@@ -81,7 +83,10 @@ class Stream(RawStream):
         unused = [name for name in names if name not in needed]
         notes = [*_frames(header), *_ignored(unused, rest, stored, kept)]
         told = {
-            "moving": (len(moving), f"the scene moves in time ({some(moving)}); all times are read as one"),
+            "moving": (
+                len(moving),
+                f"the scene moves in time ({some(moving)}); all times are read as one",
+            ),
             "flat_gaussians": (flat * len(rows), _FLAT),
             "mip_filter": ((_FILTER in names) * len(rows), _FILTERED),
         }
@@ -202,7 +207,9 @@ def _frames(header: plyfiles.PlyHeader) -> list[Note]:
     """Return a note on elements with changes of the Gaussians over time."""
     count = header.counts.get("vertex")
     groups = plyfiles.groups_of(header)
-    moving = [name for name, rows in header.counts.items() if name not in groups and rows == count != 1]
+    moving = [
+        name for name, rows in header.counts.items() if name not in groups and rows == count != 1
+    ]
     if not moving:
         return []
     what = plural(len(moving), "further element")
@@ -224,7 +231,9 @@ def _ignored(unused: list[str], rest: list[str], stored: int, kept: int) -> list
     extra = [name for name in unused if name not in known]
     notes = []
     if extra:
-        text = f"{plural(len(extra), 'extra property', 'extra properties')} ignored ({some(extra, 4)})"
+        text = (
+            f"{plural(len(extra), 'extra property', 'extra properties')} ignored ({some(extra, 4)})"
+        )
         notes.append(Note("ignored_properties", len(extra), text))
     if stored > kept:
         notes.append(Note("ignored_bands", 1, "spherical harmonics past degree 3 ignored"))

@@ -45,7 +45,8 @@ _ASCII = bytes(range(128)) + b"?" * 128
 """Translation of names and comments of other character sets, byte by byte."""
 
 _END_HEADER = re.compile(rb"(?<=[\r\n])end_header[ \t]*(\r\n|\r|\n)")
-_COUNT = re.compile(rb"(?<=[\r\n])(element[ \t]+(\S+)[ \t]+)(\d{1,4000})\b")  # Python reads no longer ones
+# Python reads no longer ones
+_COUNT = re.compile(rb"(?<=[\r\n])(element[ \t]+(\S+)[ \t]+)(\d{1,4000})\b")
 
 
 @dataclass(frozen=True)
@@ -61,7 +62,9 @@ class PlyHeader:
         """Return the properties of an element that are no lists; none if there is no such element."""
         if element not in self.elements:
             return []
-        return [p.name for p in self.elements[element].properties if not isinstance(p, PlyListProperty)]
+        return [
+            p.name for p in self.elements[element].properties if not isinstance(p, PlyListProperty)
+        ]
 
 
 def read_header(path: Path) -> PlyHeader:
@@ -306,7 +309,9 @@ def write_rows(
             raise InputError(f"not written: got {written:,} vertices, expected {count:,}")
 
 
-def row_blocks(path: Path, every: Values, rows: int, start: int = 0) -> Iterator[tuple[int, Values]]:
+def row_blocks(
+    path: Path, every: Values, rows: int, start: int = 0
+) -> Iterator[tuple[int, Values]]:
     """Yield an element's rows from `start` in blocks of `rows`, each with the index of its first row.
 
     Mapped rows are read with file reads, since mapped pages count as memory of the process.

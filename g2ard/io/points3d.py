@@ -9,7 +9,15 @@ import numpy as np
 
 from g2ard.arrays import Float
 from g2ard.errors import InputError, damaged
-from g2ard.io.colmap import Columns, Table, TextTable, model_folder, numbers_of, parsing, points_file
+from g2ard.io.colmap import (
+    Columns,
+    Table,
+    TextTable,
+    model_folder,
+    numbers_of,
+    parsing,
+    points_file,
+)
 from g2ard.io.jsonfile import Place
 from g2ard.io.stream import HeldPoints
 
@@ -32,7 +40,9 @@ class Stream(HeldPoints):
         if path.is_dir() or path.stem.lower() != "points3d":
             file = points_file(path)
             if file is None or not file.is_file():
-                raise InputError("has no points3D.bin or points3D.txt", path=model_folder(path) or path)
+                raise InputError(
+                    "has no points3D.bin or points3D.txt", path=model_folder(path) or path
+                )
             path = file
         with parsing(path):
             self._numbers = numbers_of(path.parent, names) if names else set()

@@ -19,7 +19,11 @@ _FOLDERS = (("corrected_cameras", "corrected_images"), ("cameras", "images"))
 _POSE = [f"t_{row}{column}" for row in range(3) for column in range(4)]
 _Keyframe = msgspec.defstruct(
     "_Keyframe",
-    [*((name, Number) for name in (*_POSE, "fx", "fy", "cx", "cy")), ("width", Whole), ("height", Whole)],
+    [
+        *((name, Number) for name in (*_POSE, "fx", "fy", "cx", "cy")),
+        ("width", Whole),
+        ("height", Whole),
+    ],
 )
 
 

@@ -35,7 +35,8 @@ class Report(Shown):
     """
 
     def __init_subclass__(cls) -> None:
-        if "__repr__" not in cls.__dict__:  # `dataclass` would write one that spells out nested reports
+        # `dataclass` would write one that spells out nested reports
+        if "__repr__" not in cls.__dict__:
             cls.__repr__ = Report.__repr__  # type: ignore[method-assign]
 
     def __repr__(self) -> str:
@@ -57,7 +58,9 @@ class Report(Shown):
     def as_dict(self) -> dict[str, Any]:
         """Return the report as JSON values: fields by name, nested reports as dicts."""
         values = ((f, getattr(self, f.name)) for f in fields(self))
-        return {f.name: _nested(v) for f, v in values if v is not None or "left_out" not in f.metadata}
+        return {
+            f.name: _nested(v) for f, v in values if v is not None or "left_out" not in f.metadata
+        }
 
     @classmethod
     def of(cls, data: Mapping[str, Any]) -> Self:

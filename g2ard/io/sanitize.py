@@ -72,7 +72,9 @@ class Raw:
         return Splats(means, quats, scales, logits, sh0, shN, offset, render_model, axis)
 
 
-def cleaned(raw: Raw, notes: list[Note] | None = None, render_model: RenderModel = "classic") -> Noted:
+def cleaned(
+    raw: Raw, notes: list[Note] | None = None, render_model: RenderModel = "classic"
+) -> Noted:
     """Check, clamp and activate a scene, whose arrays become those of the result.
 
     Rows with NaN or meaningless infinities are dropped. Logits (|x| > 16) and log-scales (|x| > 43) are
@@ -184,7 +186,9 @@ class Tally:
             raise InputError(f"has no {self.item}s", path=path)
         if not left:
             hint = None if points else "use an earlier checkpoint of the training"
-            raise InputError(f"none of its {plural(self.rows, self.item)} is finite", path=path, hint=hint)
+            raise InputError(
+                f"none of its {plural(self.rows, self.item)} is finite", path=path, hint=hint
+            )
         if self.noise == left:
             text = f"all of its {plural(self.noise, 'point')} are marked as noise or invalid, or at 0 0 0"
             raise InputError(text, path=path)
@@ -209,7 +213,9 @@ class Tally:
             if count
         ]
         if self.brightest < DRAWN_LOGIT and not points:
-            notes.append(Note("invisible", left, "the scene is invisible: every opacity is below 1/255"))
+            notes.append(
+                Note("invisible", left, "the scene is invisible: every opacity is below 1/255")
+            )
         return notes
 
 

@@ -46,7 +46,9 @@ FORMATS: dict[FormatName, SceneFormat] = {
     "compressed.ply": SceneFormat(".compressed.ply", "compressed_ply", loss=1),
     "ply": SceneFormat(".ply", "ply", options=("normals", "layout")),
     "sog": SceneFormat(".sog", "sog_write", loss=1, tells=True),
-    "spz": SceneFormat(".spz", "spz", options=("spz_version", "axes"), axes="RUB", loss=2, tells=True),
+    "spz": SceneFormat(
+        ".spz", "spz", options=("spz_version", "axes"), axes="RUB", loss=2, tells=True
+    ),
     "glb": SceneFormat(".glb", "glb", options=("compress",), models=False, axes="LUF"),
     "splat": SceneFormat(".splat", "splat", models=False, loss=2),
     "usda": SceneFormat(".usda", "usd", models=False, axes="RUB", tells=True),
@@ -79,12 +81,17 @@ def scene_format(path: AnyPath) -> SceneFormat:
     for output_format in FORMATS.values():
         if name.endswith(output_format.suffix):
             return output_format
-    raise OutputError(f"scenes are written as {WRITTEN}, or as a SOG folder (NAME/meta.json)", path=path)
+    raise OutputError(
+        f"scenes are written as {WRITTEN}, or as a SOG folder (NAME/meta.json)", path=path
+    )
 
 
 def files_of(path: Path) -> list[Path]:
     """Return the files that writing a scene may create: the path, or a meta.json and its images."""
-    return [path, *(path.with_name(f"{name}.webp") for name in _FOLDER_IMAGES * (path.name == "meta.json"))]
+    return [
+        path,
+        *(path.with_name(f"{name}.webp") for name in _FOLDER_IMAGES * (path.name == "meta.json")),
+    ]
 
 
 _FOLDER_IMAGES = ("means_l", "means_u", "scales", "quats", "sh0", "shN_centroids", "shN_labels")
@@ -103,9 +110,12 @@ def lost_in(path: AnyPath, splats: Splats, **options: object) -> list[Note]:
     output_format = scene_format(path)
     notes = []
     is_spz = output_format.module == "spz" or options.get("compress") == "spz"
-    if splats.antialiased and not (output_format.models or is_spz):  # SPZ inside a .glb has a flag for it
+    # SPZ inside a .glb has a flag for it
+    if splats.antialiased and not (output_format.models or is_spz):
         suffix = output_format.suffix
-        text = f"{suffix} cannot say that the scene is antialiased; other programs draw it too opaque"
+        text = (
+            f"{suffix} cannot say that the scene is antialiased; other programs draw it too opaque"
+        )
         notes.append(Note("lost_render_model", 1, text))
     if output_format.module == "splat" and (place := _unstated(path, splats)):
         notes.append(Note("lost_place", 1, place))
@@ -186,7 +196,9 @@ def axes_note(path: AnyPath, options: dict[str, Any]) -> str | None:
     """Return a note on the axes of a written file if programs differ in them; `options` are the writer's."""
     output_format = scene_format(path)
     axes = options.get("axes")
-    if "axes" not in output_format.options or (axes is not None and options.get("spz_version", 3) == 4):
+    if "axes" not in output_format.options or (
+        axes is not None and options.get("spz_version", 3) == 4
+    ):
         return None
     if axes == "RDF":
         return (

@@ -102,11 +102,18 @@ def write_splats(
     """
     from g2ard.scene.splats import scene_of
 
-    tell(path, write_scene(path, scene_of(splats), overwrite=overwrite, progress=progress, **options))
+    tell(
+        path, write_scene(path, scene_of(splats), overwrite=overwrite, progress=progress, **options)
+    )
 
 
 def write_scene(
-    path: str | Path, splats: Splats, *, overwrite: bool = False, progress: Progress = silent, **options: Any
+    path: str | Path,
+    splats: Splats,
+    *,
+    overwrite: bool = False,
+    progress: Progress = silent,
+    **options: Any,
 ) -> list[Note]:
     """Write a scene like `write_splats`, and return notes on what the file does not hold."""
     from g2ard.scene.splats import Splats

@@ -76,7 +76,9 @@ _INRIA = "give point_cloud/iteration_N/point_cloud.ply, which the trainer saves 
 _EDITOR = "open it in the editor, and export the scene as .ply"
 _LINK = "download the file that it links to, or export the scene where the page was made"
 _LAS = "convert the .las or .laz that it was made from, or export one of it"
-_SAVETXT = "of x y z red green blue in rows, `numpy.savetxt('cloud.xyz', array)` makes a table to lift"
+_SAVETXT = (
+    "of x y z red green blue in rows, `numpy.savetxt('cloud.xyz', array)` makes a table to lift"
+)
 _PATH = "a path has no photos: give views with `render --views`, such as transforms.json or g2ard's .json"
 _EUROC = "`evo_traj euroc FILE --save_as_tum` converts it, and `g2ard register --poses` reads that"
 
@@ -94,9 +96,7 @@ def _poses(
 _CAPTURE = "a table of cameras of RealityCapture (RealityScan)"
 _PIX4D = "cameras of Pix4D"
 
-_AS_TEXT = (
-    b"changed by a transfer as text"  # what `_head` adds to binary files all of whose line ends are CR LF
-)
+_AS_TEXT = b"changed by a transfer as text"  # what `_head` adds to binary files all of whose line ends are CR LF
 AGAIN = "get it again as binary (FTP: binary mode; git: `*.ply binary` in .gitattributes)"
 
 _UNFINISHED = "*.crdownload *.part *.partial *.download *.opdownload *.aria2 *.!ut *.filepart"
@@ -252,7 +252,9 @@ _FEWEST_LINES = 4  # line ends in binary data that are not CR LF by chance
 
 def _shape(head: bytes) -> bytes:
     """Return `numbers:N` for text in lines of N numbers, and whether these are poses."""
-    lines = [line.split() for line in head.splitlines()[:20] if line.strip() and line[:1] not in b"#%"]
+    lines = [
+        line.split() for line in head.splitlines()[:20] if line.strip() and line[:1] not in b"#%"
+    ]
     try:
         rows = [[float(word) for word in line] for line in lines[:-1] or lines]
     except ValueError:

@@ -119,7 +119,14 @@ class _Chunk:
             return file.read_bytes()
         except (KeyError, FileNotFoundError) as error:
             raise InputError("no such file", path=path) from error
-        except (OSError, ValueError, EOFError, RuntimeError, zipfile.BadZipFile, zlib.error) as error:
+        except (
+            OSError,
+            ValueError,
+            EOFError,
+            RuntimeError,
+            zipfile.BadZipFile,
+            zlib.error,
+        ) as error:
             raise InputError(f"cannot be read ({error})", path=path) from error
 
     @contextmanager
@@ -140,7 +147,9 @@ class _Chunk:
         """Return (count, 4) bytes, one pixel per Gaussian."""
         pixels = self.image(name).reshape(-1, 4)
         if len(pixels) < count:
-            raise InputError(f"has {len(pixels):,} pixels for {count:,} Gaussians", path=self.place / name)
+            raise InputError(
+                f"has {len(pixels):,} pixels for {count:,} Gaussians", path=self.place / name
+            )
         return pixels[:count]
 
     def count(self) -> int:
@@ -159,7 +168,9 @@ class _Chunk:
         with self.open_image(first) as image:  # before allocating memory
             pixels = image.width * image.height
         if pixels < count:
-            raise InputError(f"has {pixels:,} pixels for {count:,} Gaussians", path=self.place / first)
+            raise InputError(
+                f"has {pixels:,} pixels for {count:,} Gaussians", path=self.place / first
+            )
         return count
 
     def rest(self) -> int:
@@ -317,7 +328,8 @@ def _palette(chunk: _Chunk, part: _Rest, rest: int, count: int) -> tuple[Float32
     image = chunk.image(centroids)
     if image.shape[1] != _PALETTE_COLUMNS * rest:
         raise InputError(
-            f"has width {image.shape[1]}, expected {_PALETTE_COLUMNS * rest}", path=chunk.place / centroids
+            f"has width {image.shape[1]}, expected {_PALETTE_COLUMNS * rest}",
+            path=chunk.place / centroids,
         )
     values = _values(chunk.file.to("shN"), part)
     entries = image[:, :, :3].reshape(-1, rest, 3)
@@ -488,5 +500,12 @@ def _chunk(path: Path) -> Iterator[_Chunk]:
             yield _Chunk(path, zipfile.Path(bundle, min(inside, key=len).removesuffix("meta.json")))
     except InputError:
         raise
-    except (zipfile.BadZipFile, EOFError, OSError, ValueError, struct.error, OverflowError) as error:
+    except (
+        zipfile.BadZipFile,
+        EOFError,
+        OSError,
+        ValueError,
+        struct.error,
+        OverflowError,
+    ) as error:
         raise damaged(f"is not a complete .sog archive ({error})", path=path) from error

@@ -43,7 +43,9 @@ _LONGEST_WEBP_SIDE = 16_383  # longest side of a WebP image, pixels
 _KMEANS_STEPS = 6  # steps of k-means after the split; 10 more gain 0.01 dB
 
 
-def write(path: Path, splats: Splats, *, overwrite: bool = False, progress: Progress = silent) -> float:
+def write(
+    path: Path, splats: Splats, *, overwrite: bool = False, progress: Progress = silent
+) -> float:
     """Write a .sog: the files of `sog_files`, zipped without compression; equal scenes give equal bytes.
 
     Return the largest change of a position by rounding.
@@ -90,7 +92,9 @@ def palette_size(count: int) -> int:
     return min(1 << 16, 1 << (count.bit_length() - 1))
 
 
-def sog_files(splats: Splats, *, ordered: bool = False, progress: Progress = silent) -> dict[str, bytes]:
+def sog_files(
+    splats: Splats, *, ordered: bool = False, progress: Progress = silent
+) -> dict[str, bytes]:
     """Return the files of a scene by name, meta.json last; rows in `packing_order` unless already `ordered`.
 
     An `offset`, and other axes than y down, are stored under "g2ard" in meta.json; other programs show the
@@ -132,8 +136,16 @@ def sog_files(splats: Splats, *, ordered: bool = False, progress: Progress = sil
     if splats.sh_degree:
         count, book, centroids, entry = _rest(splats)
         files["shN_centroids.webp"] = _webp(centroids)
-        names = ["shN_centroids.webp", image("shN_labels", np.column_stack([entry & 255, entry >> 8]))]
-        meta["shN"] = {"count": count, "bands": splats.sh_degree, "codebook": book.tolist(), "files": names}
+        names = [
+            "shN_centroids.webp",
+            image("shN_labels", np.column_stack([entry & 255, entry >> 8])),
+        ]
+        meta["shN"] = {
+            "count": count,
+            "bands": splats.sh_degree,
+            "codebook": book.tolist(),
+            "files": names,
+        }
     if own := own_place(splats):
         meta["g2ard"] = own
     files["meta.json"] = json.dumps(meta, separators=(",", ":")).encode()
@@ -201,7 +213,9 @@ def _rest(splats: Splats) -> tuple[int, Float32, Bytes, Values]:
     """Return the palette's size, codebook and image, and the (N,) entries of Gaussians."""
     rest = splats.shN.shape[1]
     points = np.ascontiguousarray(splats.shN.reshape(len(splats), 3 * rest))
-    entries, labels = _core.palette(points, palette_size(len(splats)), _KMEANS_STEPS, _weights(splats))
+    entries, labels = _core.palette(
+        points, palette_size(len(splats)), _KMEANS_STEPS, _weights(splats)
+    )
     used = np.bincount(labels, minlength=len(entries)).astype(np.float32)
     book = _core.codebook(entries.ravel(), 256, np.repeat(used, 3 * rest))
     rows = math.ceil(len(entries) / _PALETTE_COLUMNS)

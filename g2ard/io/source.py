@@ -155,9 +155,7 @@ class Source:
             return PartsStream.of(self.file, *module.read(self.file))
 
 
-_UNCOLORED = (
-    "add colours, for example with PDAL's filters.colorization, or run `distill` with photos ({views=DIR})"
-)
+_UNCOLORED = "add colours, for example with PDAL's filters.colorization, or run `distill` with photos ({views=DIR})"
 
 
 def joined(sources: Sequence[Source]) -> SceneStream | PointStream:

@@ -55,7 +55,9 @@ def split_mask(views: Views, names: Sequence[str], which: str, *, stated: Splits
             of = "its only view is not"
         else:
             of = f"none of its {len(names)} views is"
-        raise InputError(f"{of} in split {which!r}; add a split.json that says which are", path=views)
+        raise InputError(
+            f"{of} in split {which!r}; add a split.json that says which are", path=views
+        )
     return masks[which]
 
 
@@ -77,7 +79,9 @@ def splits_of(views: Views, names: Sequence[str], stated: Splits = ()) -> tuple[
     """
     masks = _masks(views, names, stated)
     splits: list[str | None] = [None] * len(names)
-    for word in sorted(masks, key=lambda word: (word != "test", word != "train", word), reverse=True):
+    for word in sorted(
+        masks, key=lambda word: (word != "test", word != "train", word), reverse=True
+    ):
         for i in np.flatnonzero(masks[word]):
             splits[i] = word
     return tuple(splits)
@@ -87,7 +91,9 @@ def for_training(views: Views, names: Sequence[str], stated: Splits = ()) -> Mas
     """Return the (C,) mask of views to train on when other views are scored: "train" if splits are stated,
     otherwise all. Arguments are those of `split_mask`.
     """
-    return split_mask(views, names, "train" if states_splits(views, stated) else "all", stated=stated)
+    return split_mask(
+        views, names, "train" if states_splits(views, stated) else "all", stated=stated
+    )
 
 
 def for_scores(views: Views, names: Sequence[str], stated: Splits = ()) -> Mask:
@@ -100,7 +106,8 @@ def for_scores(views: Views, names: Sequence[str], stated: Splits = ()) -> Mask:
     mask = np.array([split != "train" for split in splits_of(views, names, stated)], bool)
     if not mask.any():
         raise InputError(
-            f"all of its {len(names)} views are for training; pass views with a test split", path=views
+            f"all of its {len(names)} views are for training; pass views with a test split",
+            path=views,
         )
     return mask
 
@@ -149,7 +156,9 @@ def _read_split(views: Path) -> dict[str, list[str]] | None:
     content: dict[str, Any] = read_json(path)
     lists = {key: value for key, value in content.items() if isinstance(value, list)}
     if not lists or not all(isinstance(name, str) for value in lists.values() for name in value):
-        raise InputError('expected lists of names, as in {"train": ["a.jpg"], "test": ["b.jpg"]}', path=path)
+        raise InputError(
+            'expected lists of names, as in {"train": ["a.jpg"], "test": ["b.jpg"]}', path=path
+        )
     return lists
 
 
@@ -160,7 +169,9 @@ def _read_apart(views: Path) -> tuple[str, list[str]] | None:
     for place in [*([model] if model else ()), *_places(views)]:
         for split in ("test", "train"):
             if usable(file := place / f"{split}.txt"):
-                return split, [word for line in read_text(file).splitlines() if (word := line.strip())]
+                return split, [
+                    word for line in read_text(file).splitlines() if (word := line.strip())
+                ]
     return None
 
 
@@ -180,7 +191,8 @@ def _listed(names: Sequence[str], wanted: Sequence[str]) -> Mask:
     if len(set(stems)) < len(set(photos)):
         exact = set(wanted)
         return np.array(
-            [name in exact or photo in exact for name, photo in zip(names, photos, strict=True)], bool
+            [name in exact or photo in exact for name, photo in zip(names, photos, strict=True)],
+            bool,
         )
     chosen = {PurePosixPath(name).stem for name in wanted}
     return np.array([stem in chosen for stem in stems], bool)
@@ -205,7 +217,9 @@ _SAME_POSE = 1e-6
 """Difference of rotations, and of positions as a share of their extent, that single precision may make."""
 
 
-def same_photos(files: Sequence[Path | None], others: Sequence[Path | None], *, copies: bool = False) -> Mask:
+def same_photos(
+    files: Sequence[Path | None], others: Sequence[Path | None], *, copies: bool = False
+) -> Mask:
     """Return whether each photo is one of `others`, by whatever name; with `copies`, also by content."""
     known = {real_path(path) for path in others if path is not None}
     alike = np.array([path is not None and real_path(path) in known for path in files], bool)
@@ -214,7 +228,9 @@ def same_photos(files: Sequence[Path | None], others: Sequence[Path | None], *, 
         hashes = set[str]()
         for row, path in enumerate(files):
             if path is not None and not alike[row] and _size(path) in sizes - {None}:
-                hashes = hashes or {content_hash(other) for other in known if _size(other) is not None}
+                hashes = hashes or {
+                    content_hash(other) for other in known if _size(other) is not None
+                }
                 alike[row] = content_hash(path) in hashes
     return alike
 

@@ -84,7 +84,9 @@ def decoded(path: Path, data: bytes) -> Noted:
     if data[:2] == b"\x1f\x8b":
         data = _gunzip(data)
     sizes = _sizes(data)
-    version, count, degree, fraction_bits, flags, stream_count = struct.unpack_from("<IIBBBB", data, 4)
+    version, count, degree, fraction_bits, flags, stream_count = struct.unpack_from(
+        "<IIBBBB", data, 4
+    )
     stored = _COEFFICIENTS[degree]
     if version == 4:
         streams = _zstd_streams(data, stream_count, sizes)
@@ -198,7 +200,9 @@ def _sizes(head: bytes) -> list[int]:
     if degree >= len(_COEFFICIENTS):
         raise InputError(f"unsupported SH degree {degree}; expected 0 to 4")
     if fraction_bits > _POSITION_BITS:
-        raise InputError(f"is {fraction_bits}, expected at most {_POSITION_BITS}", property="fractionalBits")
+        raise InputError(
+            f"is {fraction_bits}, expected at most {_POSITION_BITS}", property="fractionalBits"
+        )
     rotation = 3 if version == 2 else 4
     return [count * size for size in (9, 1, 3, 3, rotation, 3 * _COEFFICIENTS[degree])]
 

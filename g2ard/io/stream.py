@@ -36,7 +36,8 @@ MarkedPoints = tuple[Float, Float32, Mask]
 _BLACK = 1.5 / 255  # colours below are taken for none
 _FEW_BLACK = 15  # number of black points up to which no note is given
 _BLACK_SHARE = 1e-3  # share of black points up to which no note is given
-_APART = 100.0  # distance between clouds, in extents, beyond which they may be in several map systems
+# distance between clouds, in extents, beyond which they may be in several map systems
+_APART = 100.0
 _FAR = 10.0  # distance from the origin, in extents, beyond which coordinates may be those of a map
 _STEEP = 20.0  # extent in z over that in x and y beyond which x and y may be degrees
 
@@ -140,7 +141,8 @@ class Stream(ABC, Generic[Block]):
                 at = at + len(block)
             else:
                 at = first + sum(t.rows for t in self.tallies())
-        if last < self.count and not self._is_copy:  # which would hold itself, and the file, in memory
+        # which would hold itself, and the file, in memory
+        if last < self.count and not self._is_copy:
             self._reading = (kind, last), blocks
 
     def tallies(self) -> list[Tally]:
@@ -263,7 +265,9 @@ class PartsStream(SceneStream):
     @classmethod
     def of(cls, path: Path, splats: Splats, notes: Notes) -> PartsStream:
         """Return the scene of a file that was read as a whole."""
-        stream = cls(path, [len(splats)], lambda _: splats, splats.sh_degree, splats.offset, notes=notes)
+        stream = cls(
+            path, [len(splats)], lambda _: splats, splats.sh_degree, splats.offset, notes=notes
+        )
         stream.render_model = splats.render_model
         stream.up = splats.up
         stream.axes = splats.axes
@@ -383,7 +387,11 @@ class PointStream(Stream[RawPoints]):
     def marked(self, rows: int, start: int) -> Iterator[MarkedPoints]:
         """Yield `raw` with points as noise that scanners store at 0 0 0 for want of a return."""
         for positions, values, noise in self.raw(rows, start):
-            yield positions, values, noise | ~positions.any(axis=1) if self._zeros_are_lost else noise
+            yield (
+                positions,
+                values,
+                noise | ~positions.any(axis=1) if self._zeros_are_lost else noise,
+            )
 
     def header_notes(self) -> Notes:
         notes = list(self.notes)
@@ -509,7 +517,9 @@ class Joined(Stream[Block]):
     def header_notes(self) -> Notes:
         notes = []
         for stream in self.streams:
-            notes += [replace(note, text=f"{stream.path}: {note}") for note in stream.header_notes()]
+            notes += [
+                replace(note, text=f"{stream.path}: {note}") for note in stream.header_notes()
+            ]
         return tuple(notes)
 
     def _from(self, start: int) -> Iterator[tuple[int, int]]:
@@ -526,7 +536,9 @@ class JoinedScenes(Joined[Splats], SceneStream):
         rest = (max(stream.sh_degree for stream in streams) + 1) ** 2 - 1
         count = sum(s.count for s in streams)
         model = one_model([s.render_model for s in streams])
-        SceneStream.__init__(self, streams[0].path, count, rest, streams[0].offset, render_model=model)
+        SceneStream.__init__(
+            self, streams[0].path, count, rest, streams[0].offset, render_model=model
+        )
         ups = {stream.up for stream in streams}
         self.up = ups.pop() if len(ups) == 1 else None
         self.axes = common_axes([stream.axes for stream in streams])
@@ -575,7 +587,9 @@ class JoinedClouds(Joined[RawPoints], PointStream):
         stated = {stream.system: stream.path.name for stream in reversed(streams) if stream.system}
         if len(stated) > 1:
             words = ", ".join(f"{name} in {system}" for system, name in reversed(stated.items()))
-            raise InputError(f"several map systems: {words}; project all to one first", path=streams[0].path)
+            raise InputError(
+                f"several map systems: {words}; project all to one first", path=streams[0].path
+            )
         self.system = next(iter(stated), None)
         self.metres_per_unit = next((s.metres_per_unit for s in streams if s.metres_per_unit), None)
         self.notes = tuple(_far_apart(streams))
@@ -638,7 +652,9 @@ def telling(
     """
     found = []
     for names in choices or [()]:
-        positions, values, noise = (np.concatenate(column) for column in zip(*read(names), strict=True))
+        positions, values, noise = (
+            np.concatenate(column) for column in zip(*read(names), strict=True)
+        )
         found.append((names, (positions, values, noise)))
     for each in found:
         if has_contrast(each[1][1][~each[1][2]]):

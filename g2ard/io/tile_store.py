@@ -151,9 +151,13 @@ class TileStore:
         except (TypeError, ValueError, RecursionError) as error:
             raise place.to("cells").error(f"is not a tree ({error})") from error
         if tree.leaves != len(manifest.tiles):
-            raise place.to("cells").error(f"has {tree.leaves} leaves for {len(manifest.tiles)} tiles")
+            raise place.to("cells").error(
+                f"has {tree.leaves} leaves for {len(manifest.tiles)} tiles"
+            )
         if sum(tile.rows for tile in manifest.tiles) != manifest.count:
-            raise place.to("count").error(f"is {manifest.count}, which is not the sum of the tiles' rows")
+            raise place.to("count").error(
+                f"is {manifest.count}, which is not the sum of the tiles' rows"
+            )
         with_index = msgspec.structs.replace
         tiles = tuple(with_index(tile, index=i) for i, tile in enumerate(manifest.tiles))
         values |= {"tiles": tiles, "offset": np.array(manifest.offset)}

@@ -12,7 +12,9 @@ from pathlib import Path, PurePosixPath, PureWindowsPath
 from g2ard.io.finding import plain_parts
 from g2ard.io.paths import read_text, real_path
 
-_PATH = re.compile(r"(?:&(?P<anchor>\w+)\s+)?!!python/object/apply:pathlib\.(?P<kind>\w*)Path\s*(?:\[\])?$")
+_PATH = re.compile(
+    r"(?:&(?P<anchor>\w+)\s+)?!!python/object/apply:pathlib\.(?P<kind>\w*)Path\s*(?:\[\])?$"
+)
 
 
 class Settings:

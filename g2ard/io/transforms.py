@@ -157,7 +157,9 @@ def _frames(
                 left_out.append((str(entry.get("file_path")), error))
     split_of = _stated(path, lists)
     if split_of:
-        frames = [frame._replace(split=split_of.get(Path(frame.listed).as_posix())) for frame in frames]
+        frames = [
+            frame._replace(split=split_of.get(Path(frame.listed).as_posix())) for frame in frames
+        ]
     return frames, finder.notes
 
 
@@ -176,7 +178,9 @@ def _stated(path: Path, lists: dict[str, list[Any]]) -> dict[str, str]:
         for listed in lists[f"{split}_filenames"]:
             name = Path(str(listed)).as_posix()
             if stated.setdefault(name, split) != split and stated[name] == "train":
-                raise InputError(f"{name!r} is in both train_filenames and {split}_filenames", path=path)
+                raise InputError(
+                    f"{name!r} is in both train_filenames and {split}_filenames", path=path
+                )
     return stated
 
 
@@ -193,7 +197,9 @@ def _frame(place: Place, shared: Json, entry: Any, finder: Finder, masks: Finder
     if frame.mask_path is not None:
         mask = masks.find(frame.mask_path)
         if mask is None or (mask.parent == photo.parent and not is_end(frame.mask_path, mask)):
-            raise place.to("mask_path").error(f"is {folder / frame.mask_path}, which does not exist")
+            raise place.to("mask_path").error(
+                f"is {folder / frame.mask_path}, which does not exist"
+            )
     return Frame(
         name=file_path.removeprefix("./").removeprefix("images/"),
         viewmat=opencv_view(world_from_camera),
@@ -234,7 +240,9 @@ def _intrinsics(place: Place, frame: _Frame, photo: Path) -> Lens:
     width, height = _size(place, frame, photo)
     if model == "EQUIRECTANGULAR":
         if not have_same_aspect((width, height), (2, 1)):
-            raise place.error(f"is a panorama of {width}×{height} pixels, expected twice as wide as high")
+            raise place.error(
+                f"is a panorama of {width}×{height} pixels, expected twice as wide as high"
+            )
         return Lens.of(PhotoLens(model, (width, height), ()))
     lens = _pinhole(place, frame, (width, height))
     if model in _MODELS:
@@ -321,7 +329,9 @@ def text_of(path: Path, cameras: Cameras, splits: Splits) -> str:
         frames.append({**frame, **({} if shared else lenses[i]), "transform_matrix": pose.tolist()})
     head: Json = {"camera_model": "OPENCV", **shared}
     for word in sorted({word for word in splits if word}):
-        names = [frame["file_path"] for frame, own in zip(frames, splits, strict=True) if own == word]
+        names = [
+            frame["file_path"] for frame, own in zip(frames, splits, strict=True) if own == word
+        ]
         head[f"{word}_filenames"] = names
     return json.dumps(head)[:-1] + f', "frames": {json_rows(frames)}}}\n'
 

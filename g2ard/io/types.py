@@ -58,10 +58,13 @@ class Points:
 
     def __post_init__(self) -> None:
         if self.positions.ndim != 2 or self.positions.shape[1] != 3:
-            raise InputError(f"expected shape (N, 3), got {self.positions.shape}", parameter="positions")
+            raise InputError(
+                f"expected shape (N, 3), got {self.positions.shape}", parameter="positions"
+            )
         if self.colors.shape != self.positions.shape:
             raise InputError(
-                f"expected shape {self.positions.shape}, got {self.colors.shape}", parameter="colors"
+                f"expected shape {self.positions.shape}, got {self.colors.shape}",
+                parameter="colors",
             )
         object.__setattr__(self, "colors", unit_colors(self.colors).astype(np.float32))
 

@@ -39,7 +39,9 @@ _TEXT_ROWS = 8192  # rows formatted together as text
 _EXTENT_SIGMAS = 3.0  # extent of a Gaussian, as a multiple of its largest scale
 
 
-def write(path: Path, splats: Splats, *, overwrite: bool = False, progress: Progress = silent) -> float:
+def write(
+    path: Path, splats: Splats, *, overwrite: bool = False, progress: Progress = silent
+) -> float:
     """Write a .usda, or a .usdc if usd-core is installed; equal scenes give equal text.
 
     `offset` becomes the prim's translation; the layer's custom data name axes other than those of a .ply, to
@@ -75,7 +77,10 @@ def _attributes(splats: Splats) -> dict[str, tuple[str, Float32]]:
         "orientations": ("quatf[]", (unit_quats(splats.quats) * _QUAT_TURN).astype(np.float32)),
         "scales": ("float3[]", splats.scales.astype(np.float32)),
         "opacities": ("float[]", splats.opacities[:, None]),
-        f"{_SH}Coefficients": ("float3[]", np.concatenate([splats.sh0, rest], axis=1).reshape(-1, 3)),
+        f"{_SH}Coefficients": (
+            "float3[]",
+            np.concatenate([splats.sh0, rest], axis=1).reshape(-1, 3),
+        ),
     }
 
 
@@ -100,7 +105,8 @@ def _print(file: TextIO, splats: Splats, progress: Progress) -> None:
         for start in range(0, len(values), _TEXT_ROWS):
             block = values[start : start + _TEXT_ROWS]
             file.write(
-                (", " if start else "") + ", ".join([row] * len(block)) % tuple(block.ravel().tolist())
+                (", " if start else "")
+                + ", ".join([row] * len(block)) % tuple(block.ravel().tolist())
             )
             done += len(block)
             progress("pack", done, total)
@@ -197,9 +203,7 @@ def _nothing(path: Path, held: list[Any], fields: int) -> str:
     if any("nurec" in word for word in words):
         return "holds a NuRec volume, which only Omniverse reads; export the scene as .ply or ParticleField"
     if any(word in each for each in words for word in ("surfel", "surflet")):
-        return (
-            f"holds surfels (flat particles), which are not supported; export the scene as .ply or {_SCHEMA}"
-        )
+        return f"holds surfels (flat particles), which are not supported; export the scene as .ply or {_SCHEMA}"
     types = sorted({str(prim.GetTypeName()) for prim in held} - {"", "Xform", "Scope"})
     if "Mesh" in types:
         todo = f": {MESH}"
@@ -207,7 +211,9 @@ def _nothing(path: Path, held: list[Any], fields: int) -> str:
         todo = f": {SCAN}"
     else:
         todo = ""
-    return f"has no prim of type {_SCHEMA}" + (f", only {', '.join(types[:4])}{todo}" if types else "")
+    return f"has no prim of type {_SCHEMA}" + (
+        f", only {', '.join(types[:4])}{todo}" if types else ""
+    )
 
 
 def _read_prim(pxr: Any, prim: Any) -> Noted:
@@ -215,7 +221,9 @@ def _read_prim(pxr: Any, prim: Any) -> Noted:
     count = len(means)
     notes = []
     degree = _earliest(pxr, prim.GetAttribute(f"{_SH}Degree"))
-    coefficients = any(_given(pxr, prim, f"{_SH}Coefficients{half}") is not None for half in ("", "h"))
+    coefficients = any(
+        _given(pxr, prim, f"{_SH}Coefficients{half}") is not None for half in ("", "h")
+    )
     degree = int(degree) if degree is not None and coefficients else 0
     if not 0 <= degree <= 3:
         raise InputError(f"unsupported SH degree {degree}; expected 0 to 3")
@@ -235,7 +243,9 @@ def _read_prim(pxr: Any, prim: Any) -> Noted:
             raise InputError(f"has {len(rgb):,} values, expected {count:,}", property=_COLOR)
         rgb = rgb / choose_white(rgb, (1.0, 255.0))
         base = np.broadcast_to((rgb - 0.5) / SH_C0, (count, 3))
-        notes.append(Note("display_color", count, "colours are those of displayColor, taken as sRGB"))
+        notes.append(
+            Note("display_color", count, "colours are those of displayColor, taken as sRGB")
+        )
     notes += fill_linear(raw, _values(pxr, prim, "scales", 3, count), alphas, base)
     if _color_space(pxr, prim).lower().startswith("lin"):
         notes.append(LINEAR_NOTE)

@@ -77,13 +77,17 @@ def lost_views(
     return [text for count, text in lost if count]
 
 
-def check_views_output(path: str | Path, overwrite: bool = False, format: ViewFormat | None = None) -> Path:
+def check_views_output(
+    path: str | Path, overwrite: bool = False, format: ViewFormat | None = None
+) -> Path:
     """Raise the `OutputError` that `write_views` would raise, before any work."""
     return check_output(path, overwrite, folder=view_format(Path(path), format) == "colmap")
 
 
 @checks_arguments
-def read_views(path: str | Path, *, images: str | Path | None = None, split: str = "all") -> Cameras:
+def read_views(
+    path: str | Path, *, images: str | Path | None = None, split: str = "all"
+) -> Cameras:
     """Read views.
 
     Args:

@@ -45,7 +45,8 @@ def parse_count(given: int | str | None) -> int | None:
     count = float(match[1]) * _UNITS.get(match[2].lower(), 1) if match else 0.5
     if count != round(count):
         raise InputError(
-            f"expected a whole number, or text such as 50k or 1.5M, got {given!r}", parameter="count"
+            f"expected a whole number, or text such as 50k or 1.5M, got {given!r}",
+            parameter="count",
         )
     return round(count)
 
@@ -81,7 +82,9 @@ class Budget(Settings):
         super().__post_init__()
         quality = self.min_psnr if self.min_ssim is None else self.min_ssim
         if (self.count, self.ratio, self.share, self.fit, quality).count(None) != 4:
-            raise InputError("expected exactly one kind of budget: count, ratio, fit, min_psnr or min_ssim")
+            raise InputError(
+                "expected exactly one kind of budget: count, ratio, fit, min_psnr or min_ssim"
+            )
         if self.fit is not None and self.fit.lower() not in DEVICES and not self.bytes:
             raise InputError(
                 f"expected bytes such as 5MB or page:10MB, or {', '.join(DEVICES)}, got {self.fit!r}",
@@ -133,5 +136,7 @@ class Budget(Settings):
             return min(DEVICES[self.fit.lower()], total)
         assert self.count is not None
         if self.count > total:
-            raise InputError(f"expected a budget of at most {total:,}, got {self.count:,}", path=name)
+            raise InputError(
+                f"expected a budget of at most {total:,}, got {self.count:,}", path=name
+            )
         return self.count

@@ -174,7 +174,9 @@ def _find_count_of_ply(splats: Splats, wanted: int, name: str, most: int) -> int
     return count
 
 
-def find_count_for_layers(count: int, most: float, reduce: Callable[[int], Splats]) -> tuple[int, float]:
+def find_count_for_layers(
+    count: int, most: float, reduce: Callable[[int], Splats]
+) -> tuple[int, float]:
     """Return a count up to `count` whose near views blend at most `most` Gaussians per pixel, and their mean.
 
     Overdraw falls about with the square root of the count, which predicts the next one. The mean exceeds
@@ -253,7 +255,8 @@ def _predict_count(excesses: Mapping[int, float], met: int, missed: int, most: i
         missed: largest count that does not, 0 until one does not.
     """
     goal = _QUALITY_TOLERANCE / 2
-    if missed and met < most:  # interpolate between them; otherwise extrapolate from the only known side
+    # interpolate between them; otherwise extrapolate from the only known side
+    if missed and met < most:
         share = (goal - excesses[missed]) / max(excesses[met] - excesses[missed], 1e-12)
         return round(missed * (met / missed) ** min(max(share, 0.05), 0.95))
     near = met if met < most else missed
@@ -291,7 +294,9 @@ class ResolvedBudget:
             fewer = max(1, int(len(splats) * self.bytes / size * 0.99))
             if fewer == len(splats):
                 break
-            say(f"{size:,} bytes are too many: merging {len(splats):,} to {plural(fewer, 'Gaussian')}")
+            say(
+                f"{size:,} bytes are too many: merging {len(splats):,} to {plural(fewer, 'Gaussian')}"
+            )
             splats = simplify(splats, fewer, method="fast").splats
         return splats
 
@@ -301,7 +306,9 @@ class ResolvedBudget:
             return None
 
         assert self.cameras is not None
-        got = measure_quality(self.renders, pass_through_file(load_whole(splats), self.file), self.cameras)
+        got = measure_quality(
+            self.renders, pass_through_file(load_whole(splats), self.file), self.cameras
+        )
         count = plural(len(splats), "Gaussian")
         views = plural(len(self.cameras), "view")
         line = f"{count} keep {got} in the {views} that chose the count"

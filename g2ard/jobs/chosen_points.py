@@ -44,7 +44,12 @@ _Ranges = dict[str, tuple[float, float]]
 _OTHER_CLASS = 0.55, 0.55, 0.58
 _CLASSES = {
     **{2: (0.60, 0.47, 0.34), 3: (0.66, 0.80, 0.46), 4: (0.42, 0.66, 0.34), 5: (0.20, 0.48, 0.24)},
-    **{6: (0.84, 0.36, 0.30), 9: (0.26, 0.50, 0.82), 10: (0.50, 0.38, 0.56), 11: (0.36, 0.36, 0.40)},
+    **{
+        6: (0.84, 0.36, 0.30),
+        9: (0.26, 0.50, 0.82),
+        10: (0.50, 0.38, 0.56),
+        11: (0.36, 0.36, 0.40),
+    },
     **dict.fromkeys((13, 14, 15, 16), (0.95, 0.76, 0.20)),  # wires and what carries them
     17: (0.72, 0.62, 0.84),
 }
@@ -100,7 +105,9 @@ class PointChoice(Settings):
         found = self._narrowed(stream, progress, ranges)
         if found is None:
             conditions = " and ".join(f"{{{name}}}" for name in self.given if name != "color")
-            held = ", ".join(f"{name} is {low:.9g} to {high:.9g}" for name, (low, high) in ranges.items())
+            held = ", ".join(
+                f"{name} is {low:.9g} to {high:.9g}" for name, (low, high) in ranges.items()
+            )
             raise InputError(
                 f"none of {stream.count:,} points is kept: {held}",
                 path=stream.path,
@@ -108,7 +115,9 @@ class PointChoice(Settings):
             )
         return found
 
-    def _narrowed(self, stream: PointStream, progress: Progress, ranges: _Ranges) -> PointStream | None:
+    def _narrowed(
+        self, stream: PointStream, progress: Progress, ranges: _Ranges
+    ) -> PointStream | None:
         """Return the chosen points of a cloud, or None; widen the ranges of columns that were compared."""
         if not isinstance(stream, JoinedClouds):
             chosen = ChosenPoints(stream, self, progress)
@@ -139,7 +148,9 @@ class ChosenPoints(PointStream):
         self._whole = stream
         self._choice = choice
         self.ranges: _Ranges = {}
-        self._fields = {name.lower(): name for name in reversed(stream.fields) if name.isidentifier()}
+        self._fields = {
+            name.lower(): name for name in reversed(stream.fields) if name.isidentifier()
+        }
         self._shade = self._column_of_color()
         wanted = set() if choice.where is None else names_in(choice.where) & set(self._fields)
         wanted -= {*_PLACE, *_SHADES}
@@ -172,7 +183,9 @@ class ChosenPoints(PointStream):
         return [*self._whole.identity(), list(astuple(self._choice))]
 
     def header_notes(self) -> Notes:
-        kept = Note("chosen", self.count, f"{self.count:,} of {self._whole.count:,} points are read")
+        kept = Note(
+            "chosen", self.count, f"{self.count:,} of {self._whole.count:,} points are read"
+        )
         return (*(self.notes if self._shade else super().header_notes()), kept)
 
     def shown(self, values: Float32) -> Float32:
@@ -237,7 +250,9 @@ class ChosenPoints(PointStream):
             self._widen(name, found)
             return found
 
-        names = dict.fromkeys((*_PLACE, *(_SHADES if self._whole.channels else ()), *sorted(self._fields)))
+        names = dict.fromkeys(
+            (*_PLACE, *(_SHADES if self._whole.channels else ()), *sorted(self._fields))
+        )
         try:
             return keep & holds(where, list(names), column, len(positions))
         except InputError as error:
@@ -247,7 +262,10 @@ class ChosenPoints(PointStream):
         finite = values[np.isfinite(values)]
         if finite.size:
             known = self.ranges.get(name, (np.inf, -np.inf))
-            self.ranges[name] = min(known[0], float(finite.min())), max(known[1], float(finite.max()))
+            self.ranges[name] = (
+                min(known[0], float(finite.min())),
+                max(known[1], float(finite.max())),
+            )
 
     def _column_of_color(self) -> str | None:
         """Return the name of the column that colours points; None for the cloud's own colours."""

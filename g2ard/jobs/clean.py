@@ -59,7 +59,9 @@ class Cleaned(Shown):
         return self.before.take(self.clutter.keep)
 
     def __repr__(self) -> str:
-        return f"Cleaned({int(self.clutter.keep.sum()):,} of {plural(len(self.before), 'Gaussian')})"
+        return (
+            f"Cleaned({int(self.clutter.keep.sum()):,} of {plural(len(self.before), 'Gaussian')})"
+        )
 
 
 @checks_arguments
@@ -114,7 +116,9 @@ def clean(
         sky = splats.take(far)
         splats = splats.take(~far)
         say(
-            f"sky: {plural(len(sky), 'Gaussian')}" if len(sky) else "sky: none found, so nothing is split off"
+            f"sky: {plural(len(sky), 'Gaussian')}"
+            if len(sky)
+            else "sky: none found, so nothing is split off"
         )
     if not kinds:
         return Cleaned(splats, Cleaning(np.full(len(splats), -1, np.int8)), sky, None)
@@ -125,9 +129,18 @@ def clean(
         splats, cameras, floating=bool(set(kinds) & set(FLOATING)), progress=progress
     )
     clutter = find_clutter(
-        splats, seen, unoccluded, pixels, kinds, floating=floating, strength=strength, progress=progress
+        splats,
+        seen,
+        unoccluded,
+        pixels,
+        kinds,
+        floating=floating,
+        strength=strength,
+        progress=progress,
     )
-    _tell_clutter(clutter, seen.weight[~clutter.keep].sum() / max(seen.weight.sum(), 1e-30), kinds, say)
+    _tell_clutter(
+        clutter, seen.weight[~clutter.keep].sum() / max(seen.weight.sum(), 1e-30), kinds, say
+    )
     return Cleaned(splats, clutter, sky, cameras)
 
 
@@ -178,8 +191,12 @@ def choose_kinds(only: Sequence[str] | None, strength: float) -> tuple[str, ...]
     for kind in only or ():
         require("only", repr(kind), kind in KINDS, ", ".join(KINDS))
         if not strength and kind in FLOATING:
-            raise InputError(f"{kind} needs a strength", parameter="only", hint="give {strength=0.5}")
-    return tuple(kind for kind in (KINDS if only is None else only) if strength or kind not in FLOATING)
+            raise InputError(
+                f"{kind} needs a strength", parameter="only", hint="give {strength=0.5}"
+            )
+    return tuple(
+        kind for kind in (KINDS if only is None else only) if strength or kind not in FLOATING
+    )
 
 
 def paint(splats: Splats, colors: ArrayLike) -> Splats:

@@ -29,7 +29,9 @@ def close_up(splats: Splats) -> dict[str, float] | None:
     tenths of the distance of usual ones. A headset draws such views when its wearer steps closer.
     """
     try:
-        near = plan_pool(splats, _NEAR_POOL, size=_NEAR_SIZE, rows=_NEAR_ROWS).more("near", _NEAR_VIEWS)
+        near = plan_pool(splats, _NEAR_POOL, size=_NEAR_SIZE, rows=_NEAR_ROWS).more(
+            "near", _NEAR_VIEWS
+        )
     except InputError:
         return None
     found = [overdraw(splats, Cameras.of([view])) for view in near]

@@ -57,7 +57,8 @@ class Common:
     def check_same(self, other: Common, *, background: bool) -> None:
         """Raise an `InputError` unless both runs can have the same targets."""
         told = {
-            run: "photos" if run.teacher is None else f"renders of {run.teacher}" for run in (self, other)
+            run: "photos" if run.teacher is None else f"renders of {run.teacher}"
+            for run in (self, other)
         }
         places = [None if run.teacher is None else real_path(run.teacher) for run in (self, other)]
         if places[0] != places[1]:
@@ -69,7 +70,9 @@ class Common:
             )
         if not background and run_background(self.path) != run_background(other.path):
             raise InputError(
-                f"has another background than {self.path}", path=other.path, hint="give {background=COLOUR}"
+                f"has another background than {self.path}",
+                path=other.path,
+                hint="give {background=COLOUR}",
             )
 
     def each_view(self) -> Iterator[tuple[Camera, str]]:
@@ -77,7 +80,9 @@ class Common:
         for place in (run_views(self.path), self.path / "scored.json"):
             if place.is_file():
                 found, _ = load_split_views(place, "all", unpictured=self.teacher is not None)
-                yield from zip(found.cameras, (split or "train" for split in found.splits), strict=True)
+                yield from zip(
+                    found.cameras, (split or "train" for split in found.splits), strict=True
+                )
 
 
 def is_run(path: Path) -> bool:
@@ -133,7 +138,9 @@ def find_common(paths: Sequence[Path], *, background: bool = False) -> Common | 
         first.check_same(other, background=background)
     if first.teacher is not None and not first.teacher.exists():
         raise InputError(
-            f"was made from {first.teacher}, which is not there", path=first.path, hint="give {teacher=SCENE}"
+            f"was made from {first.teacher}, which is not there",
+            path=first.path,
+            hint="give {teacher=SCENE}",
         )
     if not others:
         return first
@@ -149,7 +156,10 @@ def _identify_view(view: Camera) -> _Key:
     if view.image_path is not None:
         return (real_path(view.image_path),)
     lens = np.array([view.K[0] / view.width, view.K[1] / view.height]).round(_POSE_DIGITS)
-    return (*(view.viewmat.round(_POSE_DIGITS) + 0.0).ravel().tolist(), *(lens + 0.0).ravel().tolist())
+    return (
+        *(view.viewmat.round(_POSE_DIGITS) + 0.0).ravel().tolist(),
+        *(lens + 0.0).ravel().tolist(),
+    )
 
 
 def _find_common_views(runs: Sequence[Common], rendered: bool) -> Cameras:
@@ -178,12 +188,16 @@ def _find_common_views(runs: Sequence[Common], rendered: bool) -> Cameras:
             hint="give {views} that none trained on",
         )
     sides = [max(view.width, view.height) for view in left.values()]
-    ordered = [left[key] for key in sorted(left, key=lambda key: (left[key].name, tuple(map(str, key))))]
+    ordered = [
+        left[key] for key in sorted(left, key=lambda key: (left[key].name, tuple(map(str, key))))
+    ]
     cameras = Cameras.of(_number_names(ordered))
     return cameras.scaled(max(sides)) if rendered else cameras.resized(min(sides))
 
 
-def _check_same_photos(first: Path, own: dict[_Key, Camera], second: Path, other: dict[_Key, Camera]) -> None:
+def _check_same_photos(
+    first: Path, own: dict[_Key, Camera], second: Path, other: dict[_Key, Camera]
+) -> None:
     """Raise an `InputError` unless two runs share photos, with the same poses."""
     shared = own.keys() & other.keys()
     if not shared:
@@ -193,7 +207,9 @@ def _check_same_photos(first: Path, own: dict[_Key, Camera], second: Path, other
             hint="give {views} with photos of the scene that both show",
         )
     moved = sorted(
-        own[key].name for key in shared if not np.allclose(own[key].viewmat, other[key].viewmat, atol=1e-4)
+        own[key].name
+        for key in shared
+        if not np.allclose(own[key].viewmat, other[key].viewmat, atol=1e-4)
     )
     if moved:
         raise InputError(f"has another pose of photo {moved[0]} than {first}", path=second)

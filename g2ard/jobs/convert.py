@@ -55,10 +55,14 @@ class Changes(Settings):
         super().__post_init__()
         for name, count in (("box", 6), ("sphere", 4), ("rotate", 3), ("translate", 3)):
             values = getattr(self, name)
-            fits = values is None or (np.shape(values) == (count,) and all(map(math.isfinite, values)))
+            fits = values is None or (
+                np.shape(values) == (count,) and all(map(math.isfinite, values))
+            )
             require(name, values, fits, f"{count} numbers")
         if self.invert and self.box is None and self.sphere is None:
-            raise InputError("has nothing to invert", parameter="invert", hint="give {box} or {sphere}")
+            raise InputError(
+                "has nothing to invert", parameter="invert", hint="give {box} or {sphere}"
+            )
         if self.where is not None:
             check_condition(self.where)
         if self.transform is not None:
@@ -165,7 +169,17 @@ def convert(
         points = PointChoice(None if invert else box, where, color)
         where = None
     changes = Changes(
-        box, sphere, invert, where, transform, scale, rotate, translate, recentre, to_axes, sh_degree
+        box,
+        sphere,
+        invert,
+        where,
+        transform,
+        scale,
+        rotate,
+        translate,
+        recentre,
+        to_axes,
+        sh_degree,
     )
     return changes.apply(read_merged(opened, points, from_axes, say))
 
@@ -175,7 +189,9 @@ def open_scenes(
 ) -> Source | list[Splats | Source]:
     """Return scenes that are not read yet; point clouds alone become one."""
     several = [scenes] if isinstance(scenes, Scene) else list(scenes)
-    sources = [scene if isinstance(scene, Splats) else Source(scene, render_model) for scene in several]
+    sources = [
+        scene if isinstance(scene, Splats) else Source(scene, render_model) for scene in several
+    ]
     if sources and all(isinstance(one, Source) and one.kind == "points" for one in sources):
         first, *others = (Path(one) for one in several if not isinstance(one, Splats))
         return Source(first, render_model, others)
@@ -212,7 +228,9 @@ def _load_in_axes(scene: Splats | Source, axes: AxesName | None, say: Say) -> Sp
     if axes is None:
         return splats
     if splats.axes != "RDF" and isinstance(scene, Source):
-        raise InputError("names its axes, which are followed", path=scene.file, hint="leave {from_axes} out")
+        raise InputError(
+            "names its axes, which are followed", path=scene.file, hint="leave {from_axes} out"
+        )
     defined = "RDF"
     if isinstance(scene, Source):
         if scene.format == "spz" and spz.names_axes(scene.file):

@@ -137,7 +137,9 @@ def cost_of_cleaning(scene: SceneStream, kinds: Sequence[str]) -> Cost:
     """Return the cost of finding some kinds of clutter in a scene, or of only reading it for none."""
     count = scene.count
     if not kinds:
-        return Cost(0, 0, 0, _PROGRAM_BYTES + int(_KEPT_TIMES * 4 * row_width(scene.sh_degree) * count))
+        return Cost(
+            0, 0, 0, _PROGRAM_BYTES + int(_KEPT_TIMES * 4 * row_width(scene.sh_degree) * count)
+        )
     memory = _PROGRAM_BYTES + _SURVEY[0] + _CLEANING_BYTES * count
     return Cost(CLUTTER_VIEWS, CLUTTER_SIDE**2 * 3 // 4, 0, memory)
 
@@ -153,7 +155,11 @@ def _peak_bytes(job: DistillJob, count: int, page: bool, *, trains: bool) -> int
     small = 4 * row_width(degree) * count
     rows = 0 if job.plan else dense  # that view.html may show
     chosen = job.config.select.count_of(len(train))
-    used = [train if chosen == "auto" else train.take(range(min(chosen, len(train))))] if trains else []
+    used = (
+        [train if chosen == "auto" else train.take(range(min(chosen, len(train))))]
+        if trains
+        else []
+    )
     used += [*views.untrained, *filter(None, [views.twice])]
     used += [] if views.full is None else [limit_pixels(views.full)]
     targets = _target_bytes(used, job.prior if job.renders else None, job.teaching.limit)
@@ -197,7 +203,9 @@ def check_job_memory(job: DistillJob, most: int | None, need: int) -> None:
     if job.plan is not None:
         largest = plan_round_counts(job.dense, job.budget.count, job.config)[0]
         what = f"recovering {plural(largest, 'Gaussian')} takes"
-    message = f"--memory: {what} about {format_bytes(need, ceil=True)}, more than {format_bytes(most)}"
+    message = (
+        f"--memory: {what} about {format_bytes(need, ceil=True)}, more than {format_bytes(most)}"
+    )
     lower = ", a lower --sh-degree" if job.sh_degree else ""
     message += f"; fewer Gaussians{lower} and smaller views, --size, take less"
     if job.plan is None and job.renders:  # tiles support this job

@@ -123,12 +123,15 @@ def open_tiles(
     say(f"{plan.tiles:,} tiles of {plan.count:,} Gaussians, {plan.workers} at a time")
     if planned or store is None:
         yield Opened(
-            Planned(_sample_stream(stream, lifting), count=plan.count, tile_rows=tiling.most_rows), plan
+            Planned(_sample_stream(stream, lifting), count=plan.count, tile_rows=tiling.most_rows),
+            plan,
         )
         return
     with running(plan) as runs:
         workers = Workers(runs, tiling.folder / "steps", progress)
-        yield Opened(InTiles(store, workers, config, tiling.most_rows, tiling.folder), plan, store.notes)
+        yield Opened(
+            InTiles(store, workers, config, tiling.most_rows, tiling.folder), plan, store.notes
+        )
 
 
 def _sample_stream(stream: SceneStream | PointStream, lifting: LiftConfig | None) -> Splats:

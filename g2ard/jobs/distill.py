@@ -38,7 +38,13 @@ from g2ard.progress import Detail, Progress, Say, plural, silent, unsaid
 from g2ard.rendering.targets import kinds_told
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats
-from g2ard.stages.recover.anchors import FREE, PriorMeasures, Regularizers, choose_regularizers, measure_prior
+from g2ard.stages.recover.anchors import (
+    FREE,
+    PriorMeasures,
+    Regularizers,
+    choose_regularizers,
+    measure_prior,
+)
 from g2ard.stages.recover.config import RecoverConfig, Schedule
 
 if TYPE_CHECKING:
@@ -346,7 +352,9 @@ def _adapt_to_photos(recover: RecoverConfig, options: DistillOptions) -> Recover
     return replace(recover, schedule=schedule, from_points=True)
 
 
-def _grow_steps(recover: RecoverConfig, dense: Dense, cameras: Cameras, *, of_photos: bool) -> RecoverConfig:
+def _grow_steps(
+    recover: RecoverConfig, dense: Dense, cameras: Cameras, *, of_photos: bool
+) -> RecoverConfig:
     """Return the settings with more steps for a large scene, whose pool of views grows with it."""
     times = find_pool_growth(dense.total)
     if recover.steps is not None or recover.recovery_time is not None or of_photos or times == 1:
@@ -355,12 +363,18 @@ def _grow_steps(recover: RecoverConfig, dense: Dense, cameras: Cameras, *, of_ph
     return replace(recover, steps=round(needed * times))
 
 
-def _choose_teaching(options: DistillOptions, start: Start, dense: Dense, views: RunViews) -> Teaching:
+def _choose_teaching(
+    options: DistillOptions, start: Start, dense: Dense, views: RunViews
+) -> Teaching:
     """Decide whether photos are targets, and whether renders of the dense scene are, at least elsewhere."""
     names = (*views.train.cameras.names, *views.test.names)
     paths = (*views.train.cameras.image_paths, *views.test.image_paths)
     if (start.needs_photos or options.photos) and None in paths:
-        scene = "a trained scene" if start.needs_photos else "leave out {photos} to render the scene there"
+        scene = (
+            "a trained scene"
+            if start.needs_photos
+            else "leave out {photos} to render the scene there"
+        )
         raise InputError(
             f"view {names[paths.index(None)]} has no photo",
             hint=f"give views with photos, their {{images=DIR}}, or {scene}",
@@ -401,7 +415,9 @@ def _choose_regularizers(
     return choose_regularizers(kind, prior, photos, paper=paper)
 
 
-def _describe_task(start: Start, count: int, total: int, train: Cameras | None, *, photos: bool) -> str:
+def _describe_task(
+    start: Start, count: int, total: int, train: Cameras | None, *, photos: bool
+) -> str:
     """Describe the task in one line; `train` are the views of recovery, if there is one."""
     source = plural(total, "point") if start.lifted else f"{total:,}"
     counts = f"{source} → {plural(count, 'Gaussian')}"

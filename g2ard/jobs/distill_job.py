@@ -156,7 +156,9 @@ class DistillJob:
         left = limit - spent - scoring
         least = LEAST_RECOVERY_SHARE * limit
         if left < least:
-            self.say(f"warning: {limit:g} s are short; after {spent:.1f} s recovery still gets {least:.1f} s")
+            self.say(
+                f"warning: {limit:g} s are short; after {spent:.1f} s recovery still gets {least:.1f} s"
+            )
         return max(left, least)
 
     def _scoring_seconds(self) -> float:

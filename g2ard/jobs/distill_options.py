@@ -80,7 +80,9 @@ class DistillOptions(Settings):
     def focus(self) -> Focus | None:
         """Kind of training views to add, see `SelectConfig`; `far` for the paper's methods unless named."""
         config = self.config
-        papers = config.select.views_count is not None or not config.recover.schedule.means_in_scales
+        papers = (
+            config.select.views_count is not None or not config.recover.schedule.means_in_scales
+        )
         return config.select.focus or ("far" if papers else None)
 
     @property
@@ -126,7 +128,9 @@ class DistillOptions(Settings):
         """Reject settings that only point clouds use, because the scene is a trained one."""
         for path, default in values_of(LiftConfig()).items():
             if self._full.get(path, default) != default:
-                raise InputError("has no effect on a trained scene, only on point clouds", parameter=path)
+                raise InputError(
+                    "has no effect on a trained scene, only on point clouds", parameter=path
+                )
 
     def find(self, path: str) -> Any:
         """Return the value of a path in the settings or the preset, or None."""

@@ -54,7 +54,9 @@ def doubt_views(scene: Splats, cameras: Cameras) -> list[str]:
     unframed = 1 - float(framed.mean())
     coarse = 1 - float(resolved.sum()) / seen
     if unframed > _UNFRAMED:
-        told.append(f"warning: {unframed:.0%} of the scene is in no view; --views of all of it would show it")
+        told.append(
+            f"warning: {unframed:.0%} of the scene is in no view; --views of all of it would show it"
+        )
     elif coarse > _COARSE:
         told.append(
             f"warning: {coarse:.0%} of the scene is smaller than a pixel in all views; nearer --views, or a "
@@ -135,7 +137,9 @@ def _measure_sizes(scene: Splats) -> Float:
 def _cast_votes(scene: Splats, some: Splats) -> Votes:
     """Return the votes of a sample of a scene."""
     represents = len(scene) / max(1, len(some))
-    return Votes.of(_find_points(some), _measure_sizes(some), some.opacities.astype(np.float64), represents)
+    return Votes.of(
+        _find_points(some), _measure_sizes(some), some.opacities.astype(np.float64), represents
+    )
 
 
 def _take_within(points: Float, votes: Votes) -> Float:

@@ -35,7 +35,10 @@ def describe_format_loss(path: Path, splats: Splats, options: dict[str, Any]) ->
 
     Nothing is compared if the format is exact, the scene is large or no view shows it.
     """
-    if not (scene_format(path).loss or options.get("compress")) or len(splats) > _MOST_COMPARED_GAUSSIANS:
+    if (
+        not (scene_format(path).loss or options.get("compress"))
+        or len(splats) > _MOST_COMPARED_GAUSSIANS
+    ):
         return None
     try:
         cameras = plan_pool(splats, _LOSS_VIEWS, size=_LOSS_SIZE, rows=_LOSS_ROWS).cameras

@@ -124,7 +124,9 @@ def _narrow_windows(
     return narrowed
 
 
-def _look_around(view: Camera, scene: Splats, cameras: Cameras, reach: float) -> tuple[Float, Float, Mask]:
+def _look_around(
+    view: Camera, scene: Splats, cameras: Cameras, reach: float
+) -> tuple[Float, Float, Mask]:
     """Look beyond a photo's edges.
 
     Returns:

@@ -89,7 +89,9 @@ def find_axes(cloud: Cloud, name: str, say: Say = unsaid, progress: Progress = s
     axes = guessed_axes(cloud.points.positions, progress)
     up = "xyz"[int(np.argmax(np.abs(up_in(axes))))]
     sign = "−" if min(up_in(axes)) < 0 else ""
-    say(f"note: {name}: {sign}{up} is taken for up, a guess from its surfaces; results stand upright by it")
+    say(
+        f"note: {name}: {sign}{up} is taken for up, a guess from its surfaces; results stand upright by it"
+    )
     return axes
 
 
@@ -137,7 +139,12 @@ def load_views(
 
 
 def load_view_sets(
-    views: Views, splits: Sequence[Split], size: int | None, say: Say = unsaid, *, unpictured: bool = False
+    views: Views,
+    splits: Sequence[Split],
+    size: int | None,
+    say: Say = unsaid,
+    *,
+    unpictured: bool = False,
 ) -> list[ViewSet]:
     """Read views once and return several splits at a longer side, with their weights."""
     found, path = _read_views(views, say, unpictured=unpictured)
@@ -194,9 +201,13 @@ def _choose_split(views: ViewSet, path: Path | None, split: Split) -> Mask:
     if split != "train" and (split is not for_training or not states_splits(path, views.splits)):
         return mask
     tested = [word == "test" for word in splits_of(path, names, views.splits)]
-    left = mask & ~same_photos(photos, [photo for photo, test in zip(photos, tested, strict=True) if test])
+    left = mask & ~same_photos(
+        photos, [photo for photo, test in zip(photos, tested, strict=True) if test]
+    )
     if not left.any():
-        raise InputError("no view is left for training: each photo is in the test split too", path=path)
+        raise InputError(
+            "no view is left for training: each photo is in the test split too", path=path
+        )
     return left
 
 

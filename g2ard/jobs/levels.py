@@ -82,7 +82,9 @@ class LevelReport(Report):
         """
         scores = {"merged": self.simplified, "recovered": self.recovered}
         figures = [f"{psnr:.2f} dB {what}" for what, psnr in scores.items() if psnr is not None]
-        told = f" ({', '.join(figures)}, in held-out views of {self.size} pixels)" if figures else ""
+        told = (
+            f" ({', '.join(figures)}, in held-out views of {self.size} pixels)" if figures else ""
+        )
         return f"level {number}: {plural(self.count, 'Gaussian')}{told}"
 
 
@@ -167,7 +169,9 @@ class LevelsJob:
             merged = InMemory(done.simplified)
             return level, merged, _measure_psnr(job, merged, on), _measure_psnr(job, level, on)
         if job.recovers:
-            job.say(f"{plural(count, 'Gaussian')} are too many for the memory to recover: merged only")
+            job.say(
+                f"{plural(count, 'Gaussian')} are too many for the memory to recover: merged only"
+            )
         cameras = self.job.views.merging or self.job.views.train.cameras  # at full size
         config = job.config.simplify
         small = finer.merge(count, cameras, config, gaps=True, progress=job.progress)
@@ -180,7 +184,9 @@ def _measure_psnr(job: DistillJob, scene: Dense, on: Targets) -> float:
     """Return the mean PSNR of a level in some views."""
     background = job.config.recover.background
     if isinstance(scene, InMemory):
-        return evaluate(scene.splats, on, stage="scoring", background=background, progress=job.progress).psnr
+        return evaluate(
+            scene.splats, on, stage="scoring", background=background, progress=job.progress
+        ).psnr
     drawn = scene.images(on.cameras, background)
     return float(np.mean([psnr(drawn[view], on[view]) for view in range(len(on.cameras))]))
 
@@ -371,7 +377,9 @@ def save_tileset(
         system = map_system(place)
         metres = metres_of(system)
         place, name = Georeference.of_map(system, near[0].offset), place
-        told(f"longitude {place.longitude:.6f}, latitude {place.latitude:.6f}, heading {place.heading:.3f}")
+        told(
+            f"longitude {place.longitude:.6f}, latitude {place.latitude:.6f}, heading {place.heading:.3f}"
+        )
         if is_outside(system, place):
             told(
                 f"warning: the scene lies outside the area of {name}; is it in that map system and its unit?"
@@ -398,7 +406,11 @@ def _describe_extent(coarsest: Level, metres: float, *, known: bool) -> str:
     some = take_evenly(coarsest, _UP_SAMPLE, floor=True)
     low, high = np.percentile(some.means, (1, 99), axis=0)
     across = metres * float((high - low).max())
-    text = f"the scene is {across:,.3g} m across" if across < 1000 else f"the scene is {across:,.0f} m across"
+    text = (
+        f"the scene is {across:,.3g} m across"
+        if across < 1000
+        else f"the scene is {across:,.0f} m across"
+    )
     if not known:
         text += ", if its unit is the metre; --unit ft otherwise"
     return text if _PROBABLE[0] < across < _PROBABLE[1] else f"warning: {text}"
@@ -408,7 +420,9 @@ _PROBABLE = 0.1, 20_000.0
 """Least and largest probable extent of a scene on a globe, metres."""
 
 
-def choose_tileset_up(levels: Sequence[Level], up: Numbers | None = None, say: Say = unsaid) -> Float:
+def choose_tileset_up(
+    levels: Sequence[Level], up: Numbers | None = None, say: Say = unsaid
+) -> Float:
     """Return the (3,) up direction for 3D Tiles: `up`, z in map coordinates, or an estimate."""
     coarse = levels[-1]
     if up is None and coarse.up is None and coarse.offset.any():
@@ -463,6 +477,7 @@ def write_level_page(
     reach = float(np.linalg.norm(np.ptp(few.means, axis=0)))
     start = frame.start or Start((0.0, reach / 4, -reach), (0.0, 0.0, 0.0), ((1.0, 60.0),))
     eye, target = (
-        (TILE_OF_SCENE @ (frame.world(point) - offset)).tolist() for point in (start.position, start.target)
+        (TILE_OF_SCENE @ (frame.world(point) - offset)).tolist()
+        for point in (start.position, start.target)
     )
     return write_globe_page(page, title, eye=eye, target=target, fov=start.fov, background=behind)

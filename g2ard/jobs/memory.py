@@ -121,13 +121,17 @@ def parse_bytes(text: str) -> int:
     match = _MEMORY_SIZE.fullmatch(text.strip())
     base = 1024 if "i" in text.lower() else 1000
     size = (
-        0.0 if match is None else float(match[1]) * base ** ["", "k", "m", "g", "t"].index(match[2].lower())
+        0.0
+        if match is None
+        else float(match[1]) * base ** ["", "k", "m", "g", "t"].index(match[2].lower())
     )
     require("memory", repr(text), size >= 1e6, "a size such as 4GB or 800MB")
     return int(size)
 
 
-def check_whole_memory(source: Source, tiling: Tiling, times: float, tile_times: float = 1.0) -> None:
+def check_whole_memory(
+    source: Source, tiling: Tiling, times: float, tile_times: float = 1.0
+) -> None:
     """Reject a scene that takes more than `--memory` in one piece.
 
     Args:
@@ -141,7 +145,9 @@ def check_whole_memory(source: Source, tiling: Tiling, times: float, tile_times:
     row_bytes = 4 * row_width(stream.sh_degree)
     need = _TASK_BYTES + int(times * stream.count * row_bytes)
     if need > tiling.memory:
-        tiles = TileMemory(stream.count, row_bytes, tile_times, None if source.store is None else source.path)
+        tiles = TileMemory(
+            stream.count, row_bytes, tile_times, None if source.store is None else source.path
+        )
         raise InputError(
             f"{stream.count:,} Gaussians in one piece take about {format_bytes(need, ceil=True)}, "
             f"{format_bytes(_TASK_BYTES)} of it the program, more than {_describe_limit(tiling)}; "
@@ -170,7 +176,9 @@ class TilePlan:
     disk: int
 
 
-def plan_tiles(scene: TileStore | SceneStream | PointStream, tiling: Tiling, times: float = 1.0) -> TilePlan:
+def plan_tiles(
+    scene: TileStore | SceneStream | PointStream, tiling: Tiling, times: float = 1.0
+) -> TilePlan:
     """Return the tiles of a scene, written or not, and the number of workers that memory and cores allow.
 
     Args:

@@ -130,7 +130,9 @@ def _draw_picture(shown: Any) -> str:
             return _draw_wedge(shown)
         return _embed(_shrink(load_photo(Cameras.of([shown]), 0)[0]))
     if isinstance(shown, Cameras):
-        return " ".join(_draw_picture(shown[int(view)]) for view in evenly_spaced(len(shown), _TARGETS))
+        return " ".join(
+            _draw_picture(shown[int(view)]) for view in evenly_spaced(len(shown), _TARGETS)
+        )
     held = getattr(shown, "splats", None)
     if held is None and hasattr(shown, "cameras"):
         return _embed(_draw_row(shown))

@@ -216,7 +216,9 @@ def recover(
         )
         return job.run(checkpoint, watch)
     decided = {"preset": None if preset == "auto" else preset, "photos": photos or None}
-    _refuse("views or a teacher", views=views, teacher=teacher, settings=settings, size=size, **decided)
+    _refuse(
+        "views or a teacher", views=views, teacher=teacher, settings=settings, size=size, **decided
+    )
     targets = checked_targets(targets)
     if validation is not None:
         validation = checked_targets(validation, "validation")
@@ -224,7 +226,9 @@ def recover(
     config = changed(config, full_paths(named, config))
     start = load_scene(student, say, render_model).narrowed()
     if not isinstance(anchors, Anchors | None):
-        anchors = Anchors.of(_load_anchors(anchors, start, render_model, say), config.regularizers.in_plane)
+        anchors = Anchors.of(
+            _load_anchors(anchors, start, render_model, say), config.regularizers.in_plane
+        )
     return optimize(
         start,
         targets,
@@ -307,13 +311,17 @@ def prepare(
     config = configure(RecoverConfig(), preset, {**given, "recover.regularizers": regularizers})
     if config.recovery_time is None:
         of_photos = kinds_of(targets.train) != RENDERS
-        config = replace(config, steps=config.final_steps(start, chosen.cameras, of_photos=of_photos))
+        config = replace(
+            config, steps=config.final_steps(start, chosen.cameras, of_photos=of_photos)
+        )
     of_student = "" if dense else "; measured on the student, as there is no teacher"
     say(Detail(f"regularisers: {why}{of_student}"))
     return RecoverJob(start, dense, targets, config, weights, built, why, measures, progress)
 
 
-def _load_anchors(anchors: Scene, student: Splats, render_model: RenderModel | None, say: Say) -> Splats:
+def _load_anchors(
+    anchors: Scene, student: Splats, render_model: RenderModel | None, say: Say
+) -> Splats:
     """Return the student as it was built, in its present coordinates."""
     scene = load_scene(anchors, say, render_model)
     if len(scene) != len(student):

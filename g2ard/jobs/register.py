@@ -108,7 +108,12 @@ def prepare(
     if isinstance(taken, Cameras):
         stated = {"intrinsics": intrinsics, "focal": focal, "split": split, "alpha": alpha}
         for name, value in stated.items():
-            require(name, value, value in (None, "all", "composite"), "photos by their path, not cameras")
+            require(
+                name,
+                value,
+                value in (None, "all", "composite"),
+                "photos by their path, not cameras",
+            )
     else:
         path = Path(taken)
         posed = not _photos_in(path)
@@ -205,7 +210,9 @@ def photos_of(
             say(f"{path}: {note}")
         missing = next((v.name for v in found.cameras if v.image_path is None), None)
         if missing is not None:
-            raise InputError(f"view {missing} has no photo to register; pass the folder of photos", path=path)
+            raise InputError(
+                f"view {missing} has no photo to register; pass the folder of photos", path=path
+            )
         if intrinsics is not None or focal is not None:
             raise InputError(
                 "these views state their intrinsics; drop the option that gives others", path=path
@@ -250,7 +257,9 @@ def _exif_focals(path: Path, files: list[Path], say: Say) -> list[float]:
     usual = float(np.median(known))
     without = len(files) - len(known)
     others = f"; {plural(without, 'photo')} without one get the median" if without else ""
-    say(f"note: {path}: focal lengths by EXIF, {usual:,.0f} pixels in the median, no distortion{others}")
+    say(
+        f"note: {path}: focal lengths by EXIF, {usual:,.0f} pixels in the median, no distortion{others}"
+    )
     return [usual if pixels is None else pixels for pixels in stated]
 
 
@@ -337,7 +346,9 @@ def poses_for(path: Path, names: Sequence[str]) -> dict[str, Float]:
         return read_trajectory(path, names)
     found = matched(read_poses(path), names)
     if not found:
-        raise InputError(f"no pose has the name of a photo (the first photo is {names[0]})", path=path)
+        raise InputError(
+            f"no pose has the name of a photo (the first photo is {names[0]})", path=path
+        )
     return found
 
 
@@ -355,7 +366,9 @@ def matched(found: Mapping[str, Found], names: Sequence[str]) -> dict[str, Found
     for shortened in (_flat, _stem):
         theirs = Counter(map(shortened, found))
         ours = Counter(map(shortened, names))
-        known = {shortened(name): value for name, value in found.items() if theirs[shortened(name)] == 1}
+        known = {
+            shortened(name): value for name, value in found.items() if theirs[shortened(name)] == 1
+        }
         for name in names:
             if name not in out and shortened(name) in known and ours[shortened(name)] == 1:
                 out[name] = known[shortened(name)]

@@ -133,11 +133,15 @@ def choose_views(
     if found is None:
         if not teach:
             raise InputError(
-                "generated views have no photos", parameter="photos", hint="give {views} that have them"
+                "generated views have no photos",
+                parameter="photos",
+                hint="give {views} that have them",
             )
         held_out = None
         if options.held_out is not None:
-            held_out = load_view_sets(options.held_out, [for_scores], None, say, unpictured=teach)[0].cameras
+            held_out = load_view_sets(options.held_out, [for_scores], None, say, unpictured=teach)[
+                0
+            ].cameras
         planned = _plan_views(dense, asked, _POOL_VIEWS, grow=_POOL_GROWTH)
         share = 1.0
         if options.recovers:
@@ -166,7 +170,8 @@ def choose_views(
         train = replace(train, cameras=size_like_pool(train.cameras))
         test = size_like_pool(test)
     full = keep_larger(test, options.size)
-    if options.size is not None and options.photos is False:  # photos that are not read do not limit it
+    # photos that are not read do not limit it
+    if options.size is not None and options.photos is False:
         train = replace(train, cameras=train.cameras.scaled(options.size))
         test = test.scaled(options.size)
     train = train.fitted(options.size)
@@ -189,7 +194,11 @@ def choose_views(
 def is_untouched(recover: RecoverConfig, prior: Splats, count: int, total: int) -> bool:
     """Return whether a scene already is the result if its renders are the targets."""
     degree = recover.sh_degree
-    return count == total and (degree is None or degree >= prior.sh_degree) and recover.schedule.guarded
+    return (
+        count == total
+        and (degree is None or degree >= prior.sh_degree)
+        and recover.schedule.guarded
+    )
 
 
 def choose_pool_share(recover: RecoverConfig, scene: Splats, pool: Cameras) -> float:
@@ -200,7 +209,9 @@ def choose_pool_share(recover: RecoverConfig, scene: Splats, pool: Cameras) -> f
     if recover.recovery_time is not None:
         steps = recover.recovery_time / _STEP_SECONDS
     else:
-        steps = recover.steps or count_steps_for_renders(scene, pool, schedule.for_renders * schedule.steps)
+        steps = recover.steps or count_steps_for_renders(
+            scene, pool, schedule.for_renders * schedule.steps
+        )
     return min(1.0, max(_LEAST_SHARE, (steps / _POOL_STEPS) ** _POOL_POWER))
 
 
@@ -354,7 +365,9 @@ def _add_other_kinds(
         learned = cameras[:taken][:most]
         scored = cameras[taken:]  # scored alike with and without a focus
         if len(learned) < most:
-            learned += _drop_same_places(planned.more(kind, most + spare), cameras)[: most - len(learned)]
+            learned += _drop_same_places(planned.more(kind, most + spare), cameras)[
+                : most - len(learned)
+            ]
         if kind == focus and len(learned) < 0.9 * most:
             room = f"room for {len(learned)} such views, {most} are wanted"
             given.say(f"warning: --focus {kind}: the scene has {room}")
@@ -389,7 +402,9 @@ def _add_other_kinds(
         np.append(weights, np.ones(len(more))),
     )
     if focus is None and weigh is None and not rough:
-        mixed = replace(mixed, cameras=zoomed(compact, mixed.cameras, represents=per_row, share=share))
+        mixed = replace(
+            mixed, cameras=zoomed(compact, mixed.cameras, represents=per_row, share=share)
+        )
     return mixed, others, unseen
 
 
@@ -406,7 +421,11 @@ def _merge_roughly(dense: Dense, count: int, progress: Progress) -> tuple[Splats
     rows = min(count, _COMPACT_ROWS, len(prior))
     if dense.total > len(prior):  # a sample's Gaussians cover for the others
         prior = replace(prior, scales=prior.scales * np.float32(np.sqrt(dense.total / len(prior))))
-    small = prior if rows == len(prior) else simplify(prior, rows, method="fast", progress=progress).splats
+    small = (
+        prior
+        if rows == len(prior)
+        else simplify(prior, rows, method="fast", progress=progress).splats
+    )
     return small, count / rows
 
 
@@ -445,7 +464,9 @@ def find_or_plan_views(
         apart = made.apart or ()
         splits = (*made.pool.splits, *["val"] * len(validation), *["test"] * len(apart))
         return ViewSet(Cameras.of([*made.pool.cameras, *validation, *apart]), splits=splits)
-    given.say(f"views: {len(planned.cameras)} generated; {_describe_kinds(planned, planned.cameras)}")
+    given.say(
+        f"views: {len(planned.cameras)} generated; {_describe_kinds(planned, planned.cameras)}"
+    )
     return ViewSet(planned.cameras, splits=splits_of(None, planned.cameras.names))
 
 
@@ -468,7 +489,9 @@ def resize_views(cameras: Cameras, size: Sequence[int] | None, *, made: bool) ->
     if size is None or len(size) == 1:
         return cameras.fitted(None if size is None else size[0])
     if not made:
-        raise InputError("given and found views keep their shape; give one number", parameter="size")
+        raise InputError(
+            "given and found views keep their shape; give one number", parameter="size"
+        )
     return cameras.sized(size[0], size[1])
 
 
@@ -516,7 +539,9 @@ def choose_weighing_views(dense: Dense, given: GivenViews) -> Cameras | None:
         return cameras
     try:
         pool = _plan_views(dense, given, _WEIGHT_VIEWS, rows=_WEIGHT_ROWS)
-        others = [camera for kind, count in _WEIGHT_OTHERS.items() for camera in pool.more(kind, count)]
+        others = [
+            camera for kind, count in _WEIGHT_OTHERS.items() for camera in pool.more(kind, count)
+        ]
         return Cameras.of([*pool.cameras, *others])
     except InputError as e:
         say(f"continuing without views: {e}")

@@ -53,11 +53,15 @@ def add_scores(job: DistillJob, done: Distilled) -> Distilled:
     """Return a result with its scores in held-out views, at their own size."""
     targets = done.match_exposures(job.targets.full or job.targets.held_out)
     background = job.config.recover.background
-    found = evaluate(done.splats, targets, background=background, progress=job.progress, stage="scoring")
+    found = evaluate(
+        done.splats, targets, background=background, progress=job.progress, stage="scoring"
+    )
     return replace(done, scores=replace(found, scored_in=scored_in(targets, "held-out")))
 
 
-def describe_run(job: DistillJob, done: Distilled, file: Path, drawn: Drawn | None = None) -> RunReport:
+def describe_run(
+    job: DistillJob, done: Distilled, file: Path, drawn: Drawn | None = None
+) -> RunReport:
     """Score the simplified and the recovered scene in held-out views, and describe the run.
 
     Args:
@@ -76,7 +80,10 @@ def describe_run(job: DistillJob, done: Distilled, file: Path, drawn: Drawn | No
 
     def score_both(targets: Targets) -> dict[str, Evaluation]:
         recovered = score_one("recovered", RESULT, targets)  # first, since its worst views are kept
-        return {"simplified": score_one("simplified", "simplified", targets), "recovered": recovered}
+        return {
+            "simplified": score_one("simplified", "simplified", targets),
+            "recovered": recovered,
+        }
 
     targets = job.targets
     plan = job.plan
@@ -144,7 +151,9 @@ def _collect_warnings(job: DistillJob, done: Distilled) -> tuple[str, ...]:
     if not job.config.recover.from_points:
         warnings += doubt_merging(job.prior, done.splats, blind=False)
     if job.views.guess is not None:
-        warnings.append(f"warning: the up direction is a guess ({job.views.guess}); --up X,Y,Z sets it")
+        warnings.append(
+            f"warning: the up direction is a guess ({job.views.guess}); --up X,Y,Z sets it"
+        )
     return tuple(warnings)
 
 

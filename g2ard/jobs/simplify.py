@@ -87,7 +87,11 @@ class Reduction:
             if config.method == "paper":
                 raise InputError("has no effect on the method paper", parameter="views")
         if isinstance(config, Pairs):
-            useless = {"pixel_scale": "with views"} if self._is_weighed else {"edge_weight": "without views"}
+            useless = (
+                {"pixel_scale": "with views"}
+                if self._is_weighed
+                else {"edge_weight": "without views"}
+            )
             for name in ("edge_weight", "dilation") if self.splats.antialiased else ():
                 useless.setdefault(name, "on antialiased scenes")
             for name, where in useless.items():
@@ -135,7 +139,8 @@ class Reduction:
             return None
         if self.cameras is not None:
             return self.cameras
-        from g2ard.jobs.run_views import choose_weighing_views  # loads planning, which others do not need
+        # loads planning, which others do not need
+        from g2ard.jobs.run_views import choose_weighing_views
 
         return choose_weighing_views(self.dense, self.given)
 
@@ -150,7 +155,9 @@ class Reduction:
             told += doubt_views(self.splats, self.seen)
         return told
 
-    def resolve(self, budget: Budget, name: str, file: str, sh_degree: int | None = None) -> ResolvedBudget:
+    def resolve(
+        self, budget: Budget, name: str, file: str, sh_degree: int | None = None
+    ) -> ResolvedBudget:
         """Resolve a budget for the scene, called `name` in errors.
 
         If recovery follows, bytes are searched with the method `fast` and a margin. A rough job tries
@@ -168,7 +175,9 @@ class Reduction:
             if rough:
                 say("the run measures how many Gaussians keep the quality; here, a tenth")
                 return ResolvedBudget(max(1, total // 10))
-            return self._resolve_for_quality(Quality(budget.min_psnr or 0.0, budget.min_ssim or 0.0), file)
+            return self._resolve_for_quality(
+                Quality(budget.min_psnr or 0.0, budget.min_ssim or 0.0), file
+            )
 
         def tried(count: int) -> Splats:
             if self.recovered and self.plan is None:
@@ -185,7 +194,9 @@ class Reduction:
             exact = self.plan is not None and scene_format(file).suffix == ".ply"
             most = int(size * _BYTES_SAFETY) if self.recovered and not exact else size
             try_it = None if rough else tried
-            found = find_count_for_bytes(splats, most, file, try_it, None if self.plan is None else total)
+            found = find_count_for_bytes(
+                splats, most, file, try_it, None if self.plan is None else total
+            )
         else:
             found = budget.of(total, name)
             check_positions(file, splats, found)
@@ -232,11 +243,15 @@ class Reduction:
         renders = [drawn[view] for view in range(len(cameras))]
         found, near = find_count_for_quality(renders, self.total, wanted, cameras, reduce)
         if found == self.total:
-            say(f"no smaller count was found that keeps the quality; keeping all {found:,} Gaussians")
+            say(
+                f"no smaller count was found that keeps the quality; keeping all {found:,} Gaussians"
+            )
         else:
             stage = " before recovery" if self.recovered else ""
             views = plural(len(cameras), "view")
-            say(f"{plural(found, 'Gaussian')} keep {near}{stage}, in {views} generated to choose the count")
+            say(
+                f"{plural(found, 'Gaussian')} keep {near}{stage}, in {views} generated to choose the count"
+            )
         return ResolvedBudget(
             found, file=file, wanted=wanted, renders=renders, cameras=cameras, total=self.total
         )
@@ -280,7 +295,9 @@ def open_reduction(
         from g2ard.jobs.dense import open_tiles
 
         config = options["config"]
-        with open_tiles(scene, tiling, 1.0, config, planned=given.rough, progress=progress, say=say) as tiles:
+        with open_tiles(
+            scene, tiling, 1.0, config, planned=given.rough, progress=progress, say=say
+        ) as tiles:
             counted(tiles.plan.count)
             yield Reduction(tiles.dense, given, notes=tiles.notes, plan=tiles.plan, **options)
         return

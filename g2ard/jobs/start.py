@@ -37,7 +37,9 @@ if TYPE_CHECKING:
 Given = Splats | Points | Source | None
 """Input of a distillation; None starts from photos alone."""
 
-_NO_PHOTOS = "no photos: the lifted points render the training images; photos, given as views, show more"
+_NO_PHOTOS = (
+    "no photos: the lifted points render the training images; photos, given as views, show more"
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,7 +101,9 @@ def read_start(scene: Given, budget: Budget | None, options: DistillOptions) -> 
     if options.photo_views is not None:
         return _read_photo_start(scene, options.photo_views, budget, options)
     if scene is None:
-        raise InputError("missing; without a scene, pass photos with poses as views", parameter="scene")
+        raise InputError(
+            "missing; without a scene, pass photos with poses as views", parameter="scene"
+        )
     name = "cloud" if isinstance(scene, Points) else str(scene)
     cloud = _as_cloud(scene) if isinstance(scene, Points) else read_points(scene, name, say)
     xyz = cloud.points.positions
@@ -121,7 +125,11 @@ def _read_photo_start(
     cloud, name, of_photos = _read_cloud(scene, views, train, say)
     points: Points | None = None
     if cloud is not None:
-        own = cloud.points if options.planned else colored(cloud, train, name, progress=progress, say=say)
+        own = (
+            cloud.points
+            if options.planned
+            else colored(cloud, train, name, progress=progress, say=say)
+        )
         points = distinct(own)
     found = 0 if points is None else len(points)
     usual = None
@@ -150,7 +158,9 @@ def _read_photo_start(
                 say=say,
             )
     # Each point has its disc, for as many are needed, also where positions are equal about another middle.
-    splats, _ = lift_rows(points.positions, points.colors, options.config.lift, progress, merge=False)
+    splats, _ = lift_rows(
+        points.positions, points.colors, options.config.lift, progress, merge=False
+    )
     splats = in_axes(splats, (cloud and cloud.axes) or "RDF")
     return Start(
         InMemory(splats),

@@ -49,11 +49,14 @@ def top_up_points(
     told = [plural(sparse, "sparse point")] if sparse else []
     if (missing := count - sparse) > 0:
         small = train.fitted(_PHOTO_SIDE)
-        parts.append(points_along_rays(small, missing, background=background, seed=seed, progress=progress))
+        parts.append(
+            points_along_rays(small, missing, background=background, seed=seed, progress=progress)
+        )
         told.append(f"{plural(missing, 'point')} along camera rays")
     say(f"starting from {' and '.join(told)}")
     return Points(
-        np.concatenate([part.positions for part in parts]), np.concatenate([part.colors for part in parts])
+        np.concatenate([part.positions for part in parts]),
+        np.concatenate([part.colors for part in parts]),
     )
 
 
@@ -82,12 +85,16 @@ def choose_count(train: Cameras, size: int | None, sparse: int, say: Say) -> int
     """
     cameras = train.resized(size)
     small = train.resized(_PHOTO_SIDE)
-    shares = [_measure_shown_share(small, view) for view in evenly_spaced(len(small), _SAMPLED_PHOTOS)]
+    shares = [
+        _measure_shown_share(small, view) for view in evenly_spaced(len(small), _SAMPLED_PHOTOS)
+    ]
     pixels = float(cameras.pixels.sum()) * float(np.mean(shares))
     most = max(_MOST_USUAL_COUNT, sparse)
     found = max(1, int(float(f"{min(pixels / _PIXELS_PER_GAUSSIAN, most):.2g}")))
     photos = plural(len(cameras), "photo")
-    say(f"{plural(found, 'Gaussian')}, one per {pixels / found:.0f} pixels of {photos}; a count changes it")
+    say(
+        f"{plural(found, 'Gaussian')}, one per {pixels / found:.0f} pixels of {photos}; a count changes it"
+    )
     return found
 
 
@@ -138,7 +145,9 @@ def is_sparse_file(scene: Source, views: Views) -> bool:
     return file is not None and real_path(given) == real_path(file)
 
 
-def read_sparse_points(file: Path | None, say: Say = unsaid, train: Cameras | None = None) -> Cloud | None:
+def read_sparse_points(
+    file: Path | None, say: Say = unsaid, train: Cameras | None = None
+) -> Cloud | None:
     """Read the points of `find_sparse_file`; return None, and say why, if no point is readable.
 
     With training views, points that these do not see are skipped.

@@ -24,9 +24,13 @@ from g2ard.system.cached import cached_property
 def check_teacher(views: Views | None, teacher: Scene | None) -> None:
     """Check that there is something to train on or score against: photos of views, or a teacher."""
     if teacher is None and is_made(views):
-        raise InputError("generated views have no photos", parameter="views", hint="give {teacher=SCENE}")
+        raise InputError(
+            "generated views have no photos", parameter="views", hint="give {teacher=SCENE}"
+        )
     if teacher is None and views is None:
-        raise InputError("there are no targets", hint="give {views}, or a {teacher} to generate views of")
+        raise InputError(
+            "there are no targets", hint="give {views}, or a {teacher} to generate views of"
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,14 +76,18 @@ class Teaching:
         """
         render = None
         if teacher is not None:
-            render = partial(TeacherRenders, teacher, background=background, settings=settings, lazy=True)
+            render = partial(
+                TeacherRenders, teacher, background=background, settings=settings, lazy=True
+            )
         return cls(render, insisted or teacher is None, background, chosen, insisted, rough, say)
 
     def check_photos(self, scene: Splats, cameras: Cameras, *, renders: bool = False) -> None:
         """Reject photos of another scene, see `g2ard.jobs.view_checks.check_photos`."""
         if self.photos:
             insisted = self.insisted
-            check_photos(scene, cameras, self.background, self.say, insisted=insisted, renders=renders)
+            check_photos(
+                scene, cameras, self.background, self.say, insisted=insisted, renders=renders
+            )
 
     def propose_background(self, cameras: Cameras) -> None:
         """Note if another background fits the photos."""
@@ -153,12 +161,16 @@ class RunTargets:
         return None if cameras is None else self.teaching.targets(cameras)
 
 
-def read_views(teaching: Teaching, scene: Splats, views: Views, split: str, size: int | None) -> RunViews:
+def read_views(
+    teaching: Teaching, scene: Splats, views: Views, split: str, size: int | None
+) -> RunViews:
     """Read views that train in a split; if it is `train`, the splits `test` and `val` score and validate.
 
     Photos of another scene are rejected. Only renders in views of other kinds validate.
     """
-    pool, mask = load_split_views(views, split, teaching.say, unpictured=teaching.render is not None)
+    pool, mask = load_split_views(
+        views, split, teaching.say, unpictured=teaching.render is not None
+    )
     train = pool.take(mask).fitted(size)
     if held_out := train.splits.count("test"):
         count = len(train.cameras)

@@ -101,8 +101,14 @@ def _by_time(times: Float, names: Sequence[str]) -> dict[str, int]:
         return best
     slack = float(np.median(np.abs(np.diff(times)))) / 2
     for unit in _UNITS:
-        near = {name: int(np.argmin(np.abs(times - stamp * unit))) for name, stamp in stamps.items()}
-        found = {name: row for name, row in near.items() if abs(times[row] - stamps[name] * unit) <= slack}
+        near = {
+            name: int(np.argmin(np.abs(times - stamp * unit))) for name, stamp in stamps.items()
+        }
+        found = {
+            name: row
+            for name, row in near.items()
+            if abs(times[row] - stamps[name] * unit) <= slack
+        }
         if len(found) > len(best):
             best = found
     return best

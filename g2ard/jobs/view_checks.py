@@ -75,11 +75,15 @@ def take_or_find_views(
     count = len(found.cameras)
     seeing = int(found.cameras.facing(sample_opaque_points(splats)).sum())
     if seeing < _SEEING_CAMERA_SHARE * count:
-        say(f"views beside the scene are not used: {path}: {seeing} of {plural(count, 'camera')} see it")
+        say(
+            f"views beside the scene are not used: {path}: {seeing} of {plural(count, 'camera')} see it"
+        )
         return None, False
     cameras = plural(count, "camera")
     idle = "" if given.up is None else "; --up turns generated views only"
-    say(f"views: {cameras} of {path} (found beside the scene{idle}; --views made for a pool of its own)")
+    say(
+        f"views: {cameras} of {path} (found beside the scene{idle}; --views made for a pool of its own)"
+    )
     return path, True
 
 
@@ -127,13 +131,16 @@ def check_photos(
     likeness = float(np.median(own)) if own else 0.0
     if likeness >= _UNLIKE or not len(photos.cameras):
         return
-    found = f"correlation {likeness:.2f}" if own else f"it covers less than {_SHOWN_SHARE:.0%} of them"
+    found = (
+        f"correlation {likeness:.2f}" if own else f"it covers less than {_SHOWN_SHARE:.0%} of them"
+    )
     least = _OWN_SHARE if len(splats) >= _FEW_GAUSSIANS else _FEW_OWN_SHARE
     if not insisted and (not own or (beaten and np.mean(beaten) < least)):
         raise InputError(
             f"the photos do not show the scene ({found}): they probably show another scene, or their poses "
             "use other coordinates",
-            hint=("{views=made} needs no photos, " if renders else "") + "{photos=True} uses these anyway",
+            hint=("{views=made} needs no photos, " if renders else "")
+            + "{photos=True} uses these anyway",
         )
     say(
         f"warning: the scene does not look like the photos ({found}); check the views with "
@@ -141,7 +148,9 @@ def check_photos(
     )
 
 
-def _compare_photos(splats: Splats, targets: Photos, background: Colour) -> tuple[list[float], list[float]]:
+def _compare_photos(
+    splats: Splats, targets: Photos, background: Colour
+) -> tuple[list[float], list[float]]:
     """Return per view that the scene covers enough the correlation of brightness with its own small photo,
     and the share of the others whose correlation is lower, which is empty for a single photo."""
     renderer = Renderer(splats, background=background)
@@ -159,7 +168,9 @@ def _compare_photos(splats: Splats, targets: Photos, background: Colour) -> tupl
         height, width = image.shape
         rows, columns = np.nonzero(seen)
         found = [
-            _correlate(rendered, other[rows * len(other) // height, columns * other.shape[1] // width])
+            _correlate(
+                rendered, other[rows * len(other) // height, columns * other.shape[1] // width]
+            )
             for other in images
         ]
         own.append(found[view])

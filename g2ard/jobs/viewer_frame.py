@@ -66,7 +66,9 @@ class ViewerFrame:
         """Transform a scene to this frame, without offset."""
         turn = np.eye(4)
         turn[:3, :3] = self.rotation
-        return transform(replace(splats.recentred(self.origin), offset=np.zeros(3), axes="RDF"), turn)
+        return transform(
+            replace(splats.recentred(self.origin), offset=np.zeros(3), axes="RDF"), turn
+        )
 
     def write_page(
         self, path: Path, labels: Sequence[str], scenes: Sequence[Splats], **options: Any
@@ -104,7 +106,9 @@ class ViewerFrame:
             return x, y, z
 
         return Start(
-            there(view.position), there(view.position + depth * ahead), fields or choose_fields(view)
+            there(view.position),
+            there(view.position + depth * ahead),
+            fields or choose_fields(view),
         )
 
 
@@ -138,9 +142,15 @@ def place_frame(
     up = read_stated_up(scene) if up is None else up
     axis = find_shared_up(cameras) if up is None and cameras is not None else None
     axis = up_of(scene, up) if axis is None else axis
-    best = best_views(scene, cameras=cameras, axis=axis) if cameras is None or start is None else cameras
+    best = (
+        best_views(scene, cameras=cameras, axis=axis)
+        if cameras is None or start is None
+        else cameras
+    )
     if start and start not in best.names:
-        raise InputError(f"no view {start!r} among {', '.join(best.names[:4])}, …", parameter="start")
+        raise InputError(
+            f"no view {start!r} among {', '.join(best.names[:4])}, …", parameter="start"
+        )
     view = best[best.names.index(start) if start else 0]
     stand = ViewerFrame(_rotate_upright(axis), _find_middle(scene))
     points = sample_opaque_points(scene)

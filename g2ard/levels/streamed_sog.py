@@ -91,7 +91,9 @@ def save_levels(
         environment = environment.narrowed(levels[0].offset)
     tree = cut_tree(levels, rule, work)
     files = _Files(levels, rule.most, {}, Rounding(moved), error)
-    meta = _write_meta(levels, rule, _describe_node(tree, files), list(files.parts), environment is not None)
+    meta = _write_meta(
+        levels, rule, _describe_node(tree, files), list(files.parts), environment is not None
+    )
     if work is not None:
         drop_temporaries(work)
         drop_temporaries(path.parent, path.name)
@@ -115,7 +117,11 @@ def save_levels(
 
 
 def _write_meta(
-    levels: Sequence[Level], rule: Cut, root: dict[str, Any], names: list[str], has_environment: bool
+    levels: Sequence[Level],
+    rule: Cut,
+    root: dict[str, Any],
+    names: list[str],
+    has_environment: bool,
 ) -> dict[str, Any]:
     counts = [len(level) for level in levels]
     return {
@@ -204,8 +210,13 @@ def _describe_node(tree: Node, files: _Files) -> dict[str, Any]:
     ends = np.array([tree.low, tree.high]) @ turn.T
     bound = {"min": _round(ends.min(axis=0)), "max": _round(ends.max(axis=0))}
     if tree.children:
-        return {"bound": bound, "children": [_describe_node(child, files) for child in tree.children]}
-    placed = {f"{level}": files.place(level, rows) for level, rows in enumerate(tree.rows) if len(rows)}
+        return {
+            "bound": bound,
+            "children": [_describe_node(child, files) for child in tree.children],
+        }
+    placed = {
+        f"{level}": files.place(level, rows) for level, rows in enumerate(tree.rows) if len(rows)
+    }
     return {"bound": bound, "lods": placed}
 
 
@@ -218,7 +229,10 @@ def _list_named(path: Path) -> set[Path]:
     """Return the relative paths of all level files that the folder's `lod-meta.json` names."""
     named = set()
     meta = read_object(path / "lod-meta.json")
-    parts = [*_filter_names(meta, "filenames", _CHUNK_META), *_filter_names(meta, "environment", _CHUNK_META)]
+    parts = [
+        *_filter_names(meta, "filenames", _CHUNK_META),
+        *_filter_names(meta, "environment", _CHUNK_META),
+    ]
     for part in map(Path, parts):
         named.add(part)
         for entry in read_object(path / part).values():
@@ -228,7 +242,9 @@ def _list_named(path: Path) -> set[Path]:
 
 
 @contextmanager
-def replaced(path: Path, overwrite: bool, before: set[Path]) -> Iterator[tuple[Path, dict[Path, int]]]:
+def replaced(
+    path: Path, overwrite: bool, before: set[Path]
+) -> Iterator[tuple[Path, dict[Path, int]]]:
     """Write a folder atomically, and remove those of the files `before` that it does not have.
 
     Yield the new folder, and a dict that gets the bytes of its files at the end.
@@ -237,7 +253,9 @@ def replaced(path: Path, overwrite: bool, before: set[Path]) -> Iterator[tuple[P
     with atomic_folder(path, overwrite) as folder:
         yield folder, written
         written |= {
-            file.relative_to(folder): file.stat().st_size for file in folder.rglob("*") if file.is_file()
+            file.relative_to(folder): file.stat().st_size
+            for file in folder.rglob("*")
+            if file.is_file()
         }
     stale = [path / file for file in before - written.keys()]
     for file in stale:

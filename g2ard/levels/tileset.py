@@ -111,7 +111,10 @@ def map_system(name: str) -> Any:
         raise InputError(
             f"unknown coordinate system {name!r}; expected EPSG:CODE", parameter="place"
         ) from None
-    if not system.is_projected or len({axis.unit_conversion_factor for axis in system.axis_info}) > 1:
+    if (
+        not system.is_projected
+        or len({axis.unit_conversion_factor for axis in system.axis_info}) > 1
+    ):
         raise InputError(
             f"{system.name} is not a projected system of one unit",
             parameter="place",
@@ -269,4 +272,8 @@ def _list_named(file: Path) -> set[Path]:
         tile = tiles.pop()
         names.add(str(tile.get("content", {}).get("uri", "")))
         tiles += tile.get("children", [])
-    return {Path(name) for name in names if name.endswith(".glb") and "/" not in name and "\\" not in name}
+    return {
+        Path(name)
+        for name in names
+        if name.endswith(".glb") and "/" not in name and "\\" not in name
+    }

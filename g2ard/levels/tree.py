@@ -118,7 +118,9 @@ def cut(levels: Sequence[Level], rule: Cut | None = None, scratch: Path | None =
 
 
 def _split_rows(count: int) -> Iterator[slice]:
-    return (slice(start, min(start + _ROWS_AT_ONCE, count)) for start in range(0, count, _ROWS_AT_ONCE))
+    return (
+        slice(start, min(start + _ROWS_AT_ONCE, count)) for start in range(0, count, _ROWS_AT_ONCE)
+    )
 
 
 def _measure_reach(splats: Splats) -> Float:
@@ -187,7 +189,10 @@ class _Tree:
         short = middle - int(np.count_nonzero(values < limit))
         del values
         tied = np.concatenate(
-            [part[self.means[part, axis] == limit] for part in map(rows.__getitem__, _split_rows(len(rows)))]
+            [
+                part[self.means[part, axis] == limit]
+                for part in map(rows.__getitem__, _split_rows(len(rows)))
+            ]
         )
         if axes:
             tied = tied[np.lexsort([self.means[tied, a] for a in axes])]

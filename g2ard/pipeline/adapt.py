@@ -381,7 +381,9 @@ def adapt(
     exposure = next((fit.exposure for fit in reversed(fits) if fit.exposure), None)
     if exposure is not None:
         probe.fit_exposures()
-    changed = None if change is None else {k: np.asarray(v).tolist() for k, v in vars(change).items()}
+    changed = (
+        None if change is None else {k: np.asarray(v).tolist() for k, v in vars(change).items()}
+    )
     taken = zip(config.stretches(len(targets.cameras)), scenes, strict=False)
     stretches = tuple(Stretch(steps, probe.score(scene)) for steps, scene in taken)
     report = AdaptReport(

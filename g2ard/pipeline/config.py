@@ -98,4 +98,6 @@ class DistillConfig(Settings):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.select.reselect and not self.recover.schedule.round_steps:
-            raise InputError("has no effect on a schedule without rounds", parameter="select.reselect")
+            raise InputError(
+                "has no effect on a schedule without rounds", parameter="select.reselect"
+            )

@@ -69,7 +69,9 @@ class Dense(Protocol):
             views: that weigh Gaussians by visibility; None for none.
         """
 
-    def images(self, views: Cameras, background: Colour = BLACK, limit: int = CACHE_BYTES) -> Targets:
+    def images(
+        self, views: Cameras, background: Colour = BLACK, limit: int = CACHE_BYTES
+    ) -> Targets:
         """Return the scene's images in some views, made on access; memory keeps `limit` bytes of them."""
 
     def opacity_lost(self, result: Splats, views: Cameras) -> float:
@@ -85,7 +87,9 @@ class InMemory:
 
     splats: Splats
     most_rows: ClassVar[float] = math.inf
-    _sources: dict[int, tuple[Cameras, VisibilitySource]] = field(default_factory=dict, metadata=UNKEYED)
+    _sources: dict[int, tuple[Cameras, VisibilitySource]] = field(
+        default_factory=dict, metadata=UNKEYED
+    )
 
     @property
     def sample(self) -> Splats:
@@ -127,7 +131,9 @@ class InMemory:
             progress=progress,
         )
 
-    def images(self, views: Cameras, background: Colour = BLACK, limit: int = CACHE_BYTES) -> Targets:
+    def images(
+        self, views: Cameras, background: Colour = BLACK, limit: int = CACHE_BYTES
+    ) -> Targets:
         """Return renders of the scene."""
         return TeacherRenders(self.splats, views, background=background, limit=limit, lazy=True)
 
@@ -151,7 +157,9 @@ class _Remembering:
     def __call__(self, scene: Splats) -> SampledVisibility:
         # Scales are clamped anew by each reduction; a kept scene would keep its prepared copy, too.
         arrays = [scene.means, scene.quats, scene.logit_opacities]
-        if self.first is not None and all(a is b for a, b in zip(self.first[0], arrays, strict=True)):
+        if self.first is not None and all(
+            a is b for a, b in zip(self.first[0], arrays, strict=True)
+        ):
             return self.first[1]
         seen = self.source(scene)
         if self.first is None:

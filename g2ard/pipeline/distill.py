@@ -18,7 +18,14 @@ from g2ard.pipeline.config import DistillConfig, SelectConfig
 from g2ard.pipeline.dense import Dense, InMemory, as_dense, load_whole
 from g2ard.pipeline.steps import Steps
 from g2ard.progress import Progress, plural, silent
-from g2ard.rendering.targets import Exposed, Photos, PhotosOrRenders, Subset, Targets, checked_targets
+from g2ard.rendering.targets import (
+    Exposed,
+    Photos,
+    PhotosOrRenders,
+    Subset,
+    Targets,
+    checked_targets,
+)
 from g2ard.report.run import DistillReport, RoundReport, StageSeconds, ViewsReport
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats
@@ -63,7 +70,9 @@ class RunViews:
     @property
     def untrained(self) -> list[Cameras]:
         """Views that need a target, but do not train."""
-        return [cameras for cameras in (self.test, self.validation, self.apart) if cameras is not None]
+        return [
+            cameras for cameras in (self.test, self.validation, self.apart) if cameras is not None
+        ]
 
     def resized(self, longest: int) -> RunViews:
         """Shrink all views for training and scoring."""
@@ -175,7 +184,9 @@ def distill(
     for number, count in enumerate(counts, start=1):
         if number == 1 or config.select.reselect:
             began = time.monotonic()
-            rows, weighed, views = select_views(dense.sample, targets.cameras, config, given, progress)
+            rows, weighed, views = select_views(
+                dense.sample, targets.cameras, config, given, progress
+            )
             chosen = targets if rows is None else Subset(targets, rows)
             selecting += time.monotonic() - began
         drawn = (chosen, validation) if budget < total else ()  # it may be its own teacher
@@ -202,7 +213,9 @@ def distill(
                 name,
                 scene,
                 chosen,
-                _configure_recovery(config.recover, scene, chosen.cameras, len(counts), photos, final),
+                _configure_recovery(
+                    config.recover, scene, chosen.cameras, len(counts), photos, final
+                ),
                 built=simplified,
                 weights=weighed,
                 validation=validation,
@@ -301,7 +314,14 @@ def _simplify_round(
         drawn: targets that the recovery to come draws, rendered first.
     """
     blind = config.simplify.method == "paper" or count == dense.total
-    content = [config.simplify, count, budget, None if blind else cameras, protected, *dense.identity()]
+    content = [
+        config.simplify,
+        count,
+        budget,
+        None if blind else cameras,
+        protected,
+        *dense.identity(),
+    ]
 
     def step(_: Path | None) -> tuple[Splats, SimplifyReport, dict[str, Any]]:
         steps.fill(*drawn)
@@ -327,7 +347,12 @@ def _simplify_round(
 
 
 def _configure_recovery(
-    config: RecoverConfig, scene: Splats, cameras: Cameras, rounds: int, of_photos: bool, final: bool
+    config: RecoverConfig,
+    scene: Splats,
+    cameras: Cameras,
+    rounds: int,
+    of_photos: bool,
+    final: bool,
 ) -> RecoverConfig:
     """Return the settings of one recovery: the steps of the last one, or its share of the time for all."""
     schedule = config.schedule
@@ -336,5 +361,7 @@ def _configure_recovery(
         steps = config.final_steps(scene, cameras, of_photos=of_photos) if final else None
         return replace(config, steps=steps, final=final)
     last = schedule.steps if config.steps is None else config.steps
-    limit = limit * (last if final else schedule.round_steps) / (last + rounds * schedule.round_steps)
+    limit = (
+        limit * (last if final else schedule.round_steps) / (last + rounds * schedule.round_steps)
+    )
     return replace(config, steps=None, recovery_time=limit, final=final)

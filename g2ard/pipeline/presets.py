@@ -37,7 +37,9 @@ PRESETS: dict[str, Named] = {
 """Preset name → values by path. `auto` and `paper` choose their regularisers by measuring the scene."""
 
 
-def configure(config: Config, preset: str = "auto", settings: Mapping[str, Any] | None = None) -> Config:
+def configure(
+    config: Config, preset: str = "auto", settings: Mapping[str, Any] | None = None
+) -> Config:
     """Apply a preset to a config, then individual settings.
 
     A schedule given by name is scaled to `recover.steps`. The paper's schedule implies SH degree 3.
@@ -66,7 +68,12 @@ def configure(config: Config, preset: str = "auto", settings: Mapping[str, Any] 
         given["recover.schedule"] = named if steps is None else named.scaled(steps)
     made = changed(changed(config, PRESETS[preset]), given)
     select = getattr(made, "select", None)
-    if select and select.views_count is None and select.policy != "auto" and "select.policy" in given:
+    if (
+        select
+        and select.views_count is None
+        and select.policy != "auto"
+        and "select.policy" in given
+    ):
         raise InputError("has no effect without views_count", parameter="select.policy")
     return made
 

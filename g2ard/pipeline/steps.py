@@ -93,13 +93,17 @@ class Steps:
         """
 
         def settings() -> object:
-            views = [None if each is None else fingerprint_of(each) for each in (targets, validation)]
+            views = [
+                None if each is None else fingerprint_of(each) for each in (targets, validation)
+            ]
             return config, views, built, weights
 
         def step(within: Path | None) -> _Result[RecoverReport]:
             if filled:
                 self.fill(targets, validation)
-            options["anchors"] = None if built is None else Anchors.of(built, config.regularizers.in_plane)
+            options["anchors"] = (
+                None if built is None else Anchors.of(built, config.regularizers.in_plane)
+            )
             options.update(weights=weights, validation=validation, checkpoint=within)
             options.setdefault("progress", self._progress)
             done = recover(student, targets, config, **options)

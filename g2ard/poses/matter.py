@@ -13,7 +13,15 @@ import g2ard._core as _core
 from g2ard.arrays import Float, Float32, Mask, Values
 from g2ard.errors import InputError
 from g2ard.poses.votes import Votes
-from g2ard.scene.reproducible import canonical_order, middle, norms, positive, quantile, quantiles, turned
+from g2ard.scene.reproducible import (
+    canonical_order,
+    middle,
+    norms,
+    positive,
+    quantile,
+    quantiles,
+    turned,
+)
 from g2ard.scene.splats import Splats
 from g2ard.scene.transform import rotation_matrices
 from g2ard.system.cached import cached_property
@@ -241,7 +249,8 @@ class Grid:
         steps = self.murky.ravel()[index].astype(np.float64)
         found = np.maximum(steps - 1, 0) * self.cell
         high = self.low + self.cell * np.array(self.murky.shape)
-        gaps = np.maximum(self.low - points, points - high)  # along each axis, negative within the box
+        # along each axis, negative within the box
+        gaps = np.maximum(self.low - points, points - high)
         outside = norms(np.maximum(0, gaps))
         return np.where(inside, found, np.maximum(outside, found))
 
@@ -266,7 +275,9 @@ class Grid:
         )
 
 
-def _fill_cells(low: Float, cell: float, shape: Values, matter: Matter, axes: Float) -> tuple[Float, Float]:
+def _fill_cells(
+    low: Float, cell: float, shape: Values, matter: Matter, axes: Float
+) -> tuple[Float, Float]:
     """Spread the Gaussians over the cells that they cover.
 
     A Gaussian wider than a cell is represented by n × n points on the disc of its two longer axes.

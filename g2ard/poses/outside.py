@@ -9,7 +9,15 @@ import numpy as np
 from g2ard.arrays import Float
 from g2ard.poses.sight import Lens, Poses, Rays, Survey, gather
 from g2ard.poses.site import Site
-from g2ard.scene.reproducible import between, directions, directions_at, halton, norms, quantile, turned
+from g2ard.scene.reproducible import (
+    between,
+    directions,
+    directions_at,
+    halton,
+    norms,
+    quantile,
+    turned,
+)
 from g2ard.scene.samples import evenly_spaced
 
 _ELEVATIONS = (-5.0, 50.0)
@@ -111,7 +119,8 @@ def _fit_distances(site: Site, target: Float, outward: Float, lens: Lens) -> Flo
     distances = np.empty(len(outward))
     for i, frame in enumerate(Poses(outward, -outward).frames()):
         x, y, z = turned(points, frame).T
-        in_frame = np.maximum(np.abs(x) / wide, np.abs(y) / tall)  # least depths that hold the points
+        # least depths that hold the points
+        in_frame = np.maximum(np.abs(x) / wide, np.abs(y) / tall)
         distances[i] = quantile(in_frame - z, weights, _FITTING)
     return np.maximum(distances, _OUTSIDE)
 

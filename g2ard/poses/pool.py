@@ -229,7 +229,8 @@ def plan_pool(
         used.append("near")
         reach = reach_of(survey, poses)
     spread = positive(np.ptp(poses.eyes, axis=0).max())
-    features = np.concatenate([poses.eyes / spread, poses.gazes / 4], axis=1)  # close for similar poses
+    # close for similar poses
+    features = np.concatenate([poses.eyes / spread, poses.gazes / 4], axis=1)
     order = strata(features, HOLD_OUT, seed)
     progress("poses", 1, 1)
     return Pool(
@@ -366,7 +367,8 @@ def _see_sharply(survey: Survey, poses: Poses) -> Mask:
     site = survey.site
     away = norms(poses.eyes - site.box.mean(axis=0))
     reach = away + site.diagonal / 2
-    usual = float(middle(site.grid.scale_at(site.points)))  # unweighted: a sky has few rows and much area
+    # unweighted: a sky has few rows and much area
+    usual = float(middle(site.grid.scale_at(site.points)))
     _, _, coarse = survey.glance.of(survey.cameras(poses), site.size * reach)
     return coarse < np.maximum(_SHARP, _SHARP_IN_SCALES * usual / positive(away))
 

@@ -134,7 +134,9 @@ def _look_from_within(survey: Survey, every: int = 1) -> Outlook:
     """Return views at eye level within a scene; there are fewer if `every` is more than 1."""
     wide = replace(survey, lens=Lens(survey.lens.size, WIDE))
     count = _STANDING // every
-    poses = Poses.joined([plan_inside(wide, count), plan_walk(wide, count), plan_sharp(wide, count)])
+    poses = Poses.joined(
+        [plan_inside(wide, count), plan_walk(wide, count), plan_sharp(wide, count)]
+    )
     pitch = poses.gazes[:, 2]
     level = poses.take((pitch > _GAZES[0]) & (pitch < _GAZES[1]))
     return Outlook.of(survey, wide.cameras(level), _FULL)
@@ -145,7 +147,9 @@ def is_hidden(survey: Survey) -> bool:
     below a pixel what walls surround."""
     if is_walled(survey):
         return True
-    return _is_roofed(survey) and _sees_less(_look_from_outside(survey, 2), _look_from_within(survey, 2))
+    return _is_roofed(survey) and _sees_less(
+        _look_from_outside(survey, 2), _look_from_within(survey, 2)
+    )
 
 
 def _is_roofed(survey: Survey) -> bool:
@@ -325,7 +329,8 @@ def _measure_wholeness(survey: Survey, look: Outlook) -> Float:
     outward = np.stack([camera.outward(survey.outlook.points) for camera in look.cameras])
     centrality = np.exp(-np.square(outward / _MIDDLE) / 2)
     middle = (look.seen * centrality).mean(axis=0)
-    share = np.sqrt(middle / np.maximum(look.seen.max(axis=0), 1e-30))  # of the subject, per Gaussian
+    # of the subject, per Gaussian
+    share = np.sqrt(middle / np.maximum(look.seen.max(axis=0), 1e-30))
     shown = (look.seen * share).sum(axis=1)
     uncut = np.clip((1 - outward) / _EDGE, 0, 1)
     within = (uncut * middle * share).sum(axis=1)

@@ -125,7 +125,8 @@ class Poses:
     def frames(self) -> Float:
         """Return (P, 3, 3) rotations whose rows are right, down and ahead, in the site's coordinates."""
         level = np.cross(self.gazes, [0.0, 0.0, 1.0])
-        steep = np.linalg.norm(level, axis=1) < 1e-6  # straight down: the top of the image is the site's y
+        # straight down: the top of the image is the site's y
+        steep = np.linalg.norm(level, axis=1) < 1e-6
         level[steep] = (1.0, 0.0, 0.0)
         right = level / np.linalg.norm(level, axis=1, keepdims=True)
         return np.stack([right, np.cross(self.gazes, right), self.gazes], axis=1)
@@ -213,7 +214,9 @@ class Glance:
             covered[i] = weight.sum()
             fine[i] = weight[self.sizes < _FINE * depth].sum()
             seen[i] = sums["transmittance"] / np.maximum(1, sums["hits"])
-            detail[i] = sum(np.abs(np.diff(image, axis=axis)).mean(dtype=np.float64) for axis in (0, 1))
+            detail[i] = sum(
+                np.abs(np.diff(image, axis=axis)).mean(dtype=np.float64) for axis in (0, 1)
+            )
             shown = sums["weight"].astype(np.float64)
             variances = [_measure_variance(channel, shown) for channel in self._colors.T]
             spread[i] = np.sqrt(sum(variances))

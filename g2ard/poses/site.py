@@ -134,7 +134,11 @@ class Site:
 
     @classmethod
     def of(
-        cls, splats: Splats, axis: ArrayLike | None = None, rows: int | None = None, represents: float = 1.0
+        cls,
+        splats: Splats,
+        axis: ArrayLike | None = None,
+        rows: int | None = None,
+        represents: float = 1.0,
     ) -> Site:
         """Turn a scene upright, using at most `rows` of its Gaussians, each representing `represents`.
 
@@ -160,7 +164,8 @@ class Site:
             points=points,
             weights=some.weights,
             box=box,
-            body=2 * float(missing.min()),  # a Gaussian is drawn as far as three standard deviations
+            body=2
+            * float(missing.min()),  # a Gaussian is drawn as far as three standard deviations
             terrain=terrain,
             grid=Grid.of(box[0] - margin, box[1] + margin, matter, axes),
             axes=axes,
@@ -269,7 +274,8 @@ def _choose_axes(some: Matter, axis: Float) -> Float:
     variances, vectors = np.linalg.eigh(moments(flat, weights))
     if variances[1] > _LONG * variances[0]:
         longest = vectors[:, 1]
-        sign = np.copysign(1.0, longest[np.argmax(np.abs(longest))])  # solvers return either direction
+        # solvers return either direction
+        sign = np.copysign(1.0, longest[np.argmax(np.abs(longest))])
         x, y = longest * sign
         ahead = x * ahead + y * left
     return np.stack([ahead, np.cross(axis, ahead), axis])

@@ -102,7 +102,8 @@ def estimate_up(sample: Matter) -> Up:
     if shares.max() > _LAYERED * across and _favour_habit(axis) > 1:
         return _choose_sign(sample, axis, True, "its layers face that way")
     if shape.longest is not None:
-        usual = np.eye(3)[int(np.argmax(np.abs(shape.longest)))]  # long objects lean, files are upright
+        # long objects lean, files are upright
+        usual = np.eye(3)[int(np.argmax(np.abs(shape.longest)))]
         is_usual = abs(shape.longest @ usual) > _UPRIGHT
         axis = usual if is_usual else shape.longest
         return _choose_sign(sample, axis, False, "no ground; the long axis")

@@ -13,7 +13,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from g2ard.arrays import Float, Mask
-from g2ard.scene.reproducible import along, directions, fibonacci, halton, middle, norms, positive, quantile
+from g2ard.scene.reproducible import (
+    along,
+    directions,
+    fibonacci,
+    halton,
+    middle,
+    norms,
+    positive,
+    quantile,
+)
 from g2ard.system.cached import cached_property
 
 _FOCAL = 858.0

@@ -208,7 +208,8 @@ def closed(site: Site, points: Float, rays: int, low: float, high: float) -> Flo
 def _find_connected(site: Site, points: Float) -> Mask:
     """Return whether each point belongs to a large part of the graph that joins neighbours in sight."""
     count = len(points)
-    squares = sum((column[:, None] - column) ** 2 for column in points.T)  # of the distances, (M, M)
+    # of the distances, (M, M)
+    squares = sum((column[:, None] - column) ** 2 for column in points.T)
     near = np.argsort(squares, axis=1, kind="stable")[:, 1:13]  # the first is the point itself
     start = np.repeat(np.arange(count), near.shape[1])
     stop = near.ravel()

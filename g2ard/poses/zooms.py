@@ -25,7 +25,9 @@ _SOLID = 0.3
 """Least opacity of those that count."""
 
 
-def zoomed(scene: Splats, cameras: Cameras, *, represents: float = 1.0, share: float = 1.0) -> Cameras:
+def zoomed(
+    scene: Splats, cameras: Cameras, *, represents: float = 1.0, share: float = 1.0
+) -> Cameras:
     """Turn some of the views into zooms: half the share of the Gaussians in sight that they show small.
 
     A zoom has as many pixels as its view, shows a window of the view at twice its size, and holds a Gaussian

@@ -107,4 +107,6 @@ def reaching(splats: Splats, cameras: Cameras, box: Float) -> Mask:
     here = cameras.recentred(splats.offset)
     views = [view_of(here, i, _ANY_DEPTH) for i in range(len(here))]
     largest = np.ascontiguousarray(splats.scales.max(axis=1))
-    return _core.reaching(splats.means, largest, splats.opacities, views, corners_of(box - splats.offset))
+    return _core.reaching(
+        splats.means, largest, splats.opacities, views, corners_of(box - splats.offset)
+    )

@@ -50,7 +50,9 @@ class Exposure(Report):
         """Describe the exposures of the views that have a photo."""
         names = targets.cameras.names
         rows = [view for view in range(len(names)) if against_of(targets, view) == "photo"]
-        gain, offset = ((float(x.min()), float(x.max())) for x in np.moveaxis(exposures[rows], 2, 0))
+        gain, offset = (
+            (float(x.min()), float(x.max())) for x in np.moveaxis(exposures[rows], 2, 0)
+        )
         return cls(gain, offset, {names[row]: exposures[row].tolist() for row in rows})
 
     def __str__(self) -> str:
@@ -97,7 +99,9 @@ def _find_backdrop(alpha: Float32 | None, background: Background) -> Float32 | f
     return (1 - alpha[..., None]) * np.asarray(background, np.float32)
 
 
-def _compare_moments(image: Float32, targets: Targets, view: int, background: Background) -> Moments:
+def _compare_moments(
+    image: Float32, targets: Targets, view: int, background: Background
+) -> Moments:
     """Compare a render, not clipped, with a photo where neither too bright nor too dark to tell."""
     photo = targets[view]
     alpha = alpha_of(targets, view)

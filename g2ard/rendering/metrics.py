@@ -69,7 +69,9 @@ def detail(image: _Image, target: _Image, mask: Mask | None = None) -> float:
     >>> detail(flat, flat + 0.1)
     1.0
     """
-    count, _, own, wanted, common = _core.steps(_as_float32(image), _as_float32(target), _counts(mask))
+    count, _, own, wanted, common = _core.steps(
+        _as_float32(image), _as_float32(target), _counts(mask)
+    )
     least = max(1, count) * _INVISIBLE**2
     return float((common + least) / np.sqrt((own + least) * (wanted + least)))
 
@@ -218,7 +220,9 @@ class Lpips:
 
         with torch.inference_mode():
             total = 0.0
-            for a, b, weight in zip(self._maps(image), self._maps(target), self._linear, strict=True):
+            for a, b, weight in zip(
+                self._maps(image), self._maps(target), self._linear, strict=True
+            ):
                 difference = (_normalize(a) - _normalize(b)) ** 2
                 total += float((difference * weight).sum(1).mean())
         return total
@@ -268,7 +272,9 @@ def load_lpips(folder: Path, *, scaled: bool = True) -> dict[str, Lpips]:
             try:
                 files.append(torch.load(path, map_location="cpu", weights_only=True))
             except Exception as error:  # torch raises any exception from unpickling
-                raise InputError(f"not a torch state dict ({type(error).__name__})", path=path) from None
+                raise InputError(
+                    f"not a torch state dict ({type(error).__name__})", path=path
+                ) from None
         out[net] = Lpips(net, files[0], files[1], scaled=scaled)
     if not out:
         raise InputError(

@@ -44,7 +44,9 @@ def recoloured(dense: Splats, small: Splats, views: Cameras, progress: Progress 
     arrays = arrays_of(dense)
 
     def shown(view: int) -> tuple[Float32, Float32]:
-        image, alpha, *_ = _draw(_core.Rasterizer(), arrays, view_of(cameras, view, settings), settings)
+        image, alpha, *_ = _draw(
+            _core.Rasterizer(), arrays, view_of(cameras, view, settings), settings
+        )
         return image, alpha
 
     return shifted(small, chosen, shown, settings, progress)

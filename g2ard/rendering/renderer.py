@@ -180,7 +180,11 @@ class Renderer:
 
     @checks_arguments
     def __init__(
-        self, splats: Splats, *, background: Sequence[float] = BLACK, settings: RasterSettings | None = None
+        self,
+        splats: Splats,
+        *,
+        background: Sequence[float] = BLACK,
+        settings: RasterSettings | None = None,
     ) -> None:
         self.background = [float(c) for c in background]
         if settings is not None and not isinstance(settings.near, int | float | None):
@@ -200,7 +204,9 @@ class Renderer:
             InputError: an invalid camera, see `Cameras`.
         """
         view = self._view(camera)
-        return self._rasterizer.image(self._arrays, view, self._settings, self.background, self._bounds)
+        return self._rasterizer.image(
+            self._arrays, view, self._settings, self.background, self._bounds
+        )
 
     def clipped(self, camera: Camera) -> Float32:
         """Return `image` clipped to [0, 1], as photos are."""
@@ -235,10 +241,14 @@ class Renderer:
         """Draw a box of the scene on the planes of a `rendering.boxes.Canvas`, in place."""
         corners = corners_of(box - self._offset)
         view = self._view(camera)
-        self._rasterizer.draw(self._arrays, view, self._settings, corners, (color, light), self._bounds)
+        self._rasterizer.draw(
+            self._arrays, view, self._settings, corners, (color, light), self._bounds
+        )
 
     @checks_arguments
-    def panorama(self, camera: Camera, *, width: Annotated[int, Within("[4, inf)")] = 2048) -> Rendered:
+    def panorama(
+        self, camera: Camera, *, width: Annotated[int, Within("[4, inf)")] = 2048
+    ) -> Rendered:
         """Render an equirectangular panorama: all directions around a camera.
 
         Six pinhole renders, the faces of a cube at twice the resolution, are resampled.

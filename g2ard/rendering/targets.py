@@ -119,7 +119,9 @@ def checked_targets(targets: Targets, parameter: str = "targets") -> Targets:
     """
     if isinstance(targets, Cached | _Chosen):
         return targets
-    if not isinstance(getattr(targets, "cameras", None), Cameras) or not hasattr(targets, "__getitem__"):
+    if not isinstance(getattr(targets, "cameras", None), Cameras) or not hasattr(
+        targets, "__getitem__"
+    ):
         raise InputError(
             f"expected cameras with an image each, got a value of type {type(targets).__name__}",
             parameter=parameter,
@@ -128,7 +130,9 @@ def checked_targets(targets: Targets, parameter: str = "targets") -> Targets:
     return _Converted(targets, parameter)
 
 
-def as_image(image: Any, cameras: Cameras, view: int, parameter: str) -> NDArray[np.uint8 | np.float32]:
+def as_image(
+    image: Any, cameras: Cameras, view: int, parameter: str
+) -> NDArray[np.uint8 | np.float32]:
     """Return an image of a view, (H, W, 3) or (H, W, 4) in uint8 or float32, without a copy if possible.
 
     Args:
@@ -149,7 +153,9 @@ def as_image(image: Any, cameras: Cameras, view: int, parameter: str) -> NDArray
         if array.shape[1:] == (height, width):
             hint = "move the channels to the end"
         elif array.ndim == 3:
-            hint = "scale the images to the size of their cameras, or the cameras with cameras.resized"
+            hint = (
+                "scale the images to the size of their cameras, or the cameras with cameras.resized"
+            )
     elif array.dtype == np.uint8:
         return array
     elif array.dtype.kind != "f":
@@ -216,7 +222,9 @@ class _Chosen(_Sourced):
     def _parts(self, views: Sequence[int] | None = None) -> list[tuple[Targets, list[int]]]:
         """Return the other targets and the rows in them of some views, of all by default."""
         parts: dict[int, tuple[Targets, list[int]]] = {}
-        for targets, row in self._places if views is None else [self._places[view] for view in views]:
+        for targets, row in (
+            self._places if views is None else [self._places[view] for view in views]
+        ):
             parts.setdefault(id(targets), (targets, []))[1].append(row)
         return list(parts.values())
 
@@ -404,7 +412,9 @@ class Photos(Cached):
                 masks = tuple(Path(new) if mask and mask == old else mask for old, mask, new in own)
                 cameras = replace(cameras, image_paths=tuple(map(Path, images)), mask_paths=masks)
             else:
-                self._images = [as_image(image, cameras, i, "images") for i, image in enumerate(images)]
+                self._images = [
+                    as_image(image, cameras, i, "images") for i, image in enumerate(images)
+                ]
                 cameras = replace(cameras, image_paths=(), mask_paths=())
         if self._images is None and None in cameras.image_paths:
             raise InputError(
@@ -440,7 +450,9 @@ class Photos(Cached):
         return alpha
 
     def _alpha(self, view: int) -> Float32 | None:
-        own = load_photo(self.cameras, view, None)[0] if self._images is None else self._images[view]
+        own = (
+            load_photo(self.cameras, view, None)[0] if self._images is None else self._images[view]
+        )
         return _as_floats(own)[..., 3].copy() if own.shape[2] == 4 else None
 
     def _stored(self, view: int) -> Values:
@@ -586,18 +598,27 @@ class PhotosOrRenders(_Chosen):
         photos = Photos(parts[0], background=background, exposures=exposures, limit=limit)
         others: Targets
         if isinstance(teacher, Splats):
-            others = TeacherRenders(teacher, parts[1], background=background, limit=limit, **renders)
+            others = TeacherRenders(
+                teacher, parts[1], background=background, limit=limit, **renders
+            )
         else:
             others = teacher(parts[1])
         rows = np.where(pictured, np.cumsum(pictured), np.cumsum(~pictured)) - 1
-        places = [(photos if photo else others, int(row)) for photo, row in zip(pictured, rows, strict=True)]
+        places = [
+            (photos if photo else others, int(row))
+            for photo, row in zip(pictured, rows, strict=True)
+        ]
         super().__init__(cameras, places)
 
 
 def _invert_exposure(name: str, exposure: Float) -> Float32:
     """Return the (3, 4) transform from the photo `name` to a render, from its exposure (render to photo)."""
     matrix = np.asarray(exposure, np.float64)
-    if matrix.shape != (3, 4) or not np.isfinite(matrix).all() or abs(np.linalg.det(matrix[:, :3])) < 1e-6:
+    if (
+        matrix.shape != (3, 4)
+        or not np.isfinite(matrix).all()
+        or abs(np.linalg.det(matrix[:, :3])) < 1e-6
+    ):
         raise InputError(f"exposure of {name}: expected an invertible 3×4 matrix")
     inverse = np.linalg.inv(matrix[:, :3])
     return np.hstack([inverse, -inverse @ matrix[:, 3:]]).astype(np.float32)

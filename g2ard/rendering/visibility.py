@@ -109,12 +109,15 @@ def overdraw(splats: Splats, cameras: Cameras, progress: Progress = silent) -> f
     >>> overdraw(walls, Cameras.of([Camera.facing([0, -30, 0], [0, 0, 0], width=32, height=24, fov=10)]))
     3.0
     """
-    faint = RasterSettings(alpha_max=1 / 255)  # comes after the test, so that light is never used up
+    # comes after the test, so that light is never used up
+    faint = RasterSettings(alpha_max=1 / 255)
     seen = visibility(splats, cameras, progress, settings=faint)
     return float(seen.hits.sum() / cameras.pixels.sum())
 
 
-def visibility_source(cameras: Cameras, *, longest: int = LONGEST, progress: Progress = silent) -> _Sampler:
+def visibility_source(
+    cameras: Cameras, *, longest: int = LONGEST, progress: Progress = silent
+) -> _Sampler:
     """Return a function that samples a scene's visibility from a few small renders, for `simplify`.
 
     Views are rendered in rounds of sixteen until a round finds under 1 % more of the Gaussians, and at least
@@ -166,7 +169,9 @@ class _Sampler:
         here = self.views.recentred(scene.offset)
         if self.used is None:
             distance = np.median(np.linalg.norm(here.positions - core.origin, axis=1))
-            self.settings = RasterSettings(antialiased=scene.antialiased, near=NEAR * float(distance) or None)
+            self.settings = RasterSettings(
+                antialiased=scene.antialiased, near=NEAR * float(distance) or None
+            )
             self.used = add_until_converged(
                 lambda views: self._add(sums, here, views),
                 len(here),
@@ -190,7 +195,9 @@ class _Sampler:
         return sums.add(made, self.settings, counter(self.progress, "visibility"))
 
 
-def add_until_converged(add: Callable[[range], int], count: int, rows: int, *, free: int = 0) -> list[range]:
+def add_until_converged(
+    add: Callable[[range], int], count: int, rows: int, *, free: int = 0
+) -> list[range]:
     """Add rounds of views until one finds few new Gaussians; return those that were added.
 
     Args:

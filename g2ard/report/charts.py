@@ -8,7 +8,17 @@ from dataclasses import dataclass
 from html import escape
 from itertools import pairwise
 
-COLORS = ("#2563eb", "#d97706", "#059669", "#db2777", "#7c3aed", "#64748b", "#0891b2", "#b91c1c", "#65a30d")
+COLORS = (
+    "#2563eb",
+    "#d97706",
+    "#059669",
+    "#db2777",
+    "#7c3aed",
+    "#64748b",
+    "#0891b2",
+    "#b91c1c",
+    "#65a30d",
+)
 _WIDTH = 560
 """Width of a chart in pixels."""
 _HEIGHT = 340
@@ -132,7 +142,9 @@ def draw_chart(
     Returns:
         An <svg> element; "" if there is no point to draw.
     """
-    points = [p for p in points if math.isfinite(p.y) and math.isfinite(p.x) and (p.x > 0 or not log)]
+    points = [
+        p for p in points if math.isfinite(p.y) and math.isfinite(p.x) and (p.x > 0 or not log)
+    ]
     if not points:
         return ""
     x = _Axis([p.x for p in points], _LEFT, _WIDTH - _RIGHT, log=log)
@@ -154,8 +166,12 @@ def _draw_grid(x: _Axis, y: _Axis) -> list[str]:
     out = []
     for value in choose_ticks(y.low, y.high):
         at = y(value)
-        out.append(f'<line class="grid" x1="{_LEFT}" x2="{_WIDTH - _RIGHT}" y1="{at:.1f}" y2="{at:.1f}"/>')
-        out.append(f'<text class="tick" x="{_LEFT - 6}" y="{at + 4:.1f}" text-anchor="end">{value:g}</text>')
+        out.append(
+            f'<line class="grid" x1="{_LEFT}" x2="{_WIDTH - _RIGHT}" y1="{at:.1f}" y2="{at:.1f}"/>'
+        )
+        out.append(
+            f'<text class="tick" x="{_LEFT - 6}" y="{at + 4:.1f}" text-anchor="end">{value:g}</text>'
+        )
     for value in choose_ticks(x.low, x.high, log=x.log):
         at = x(value)
         bottom = _HEIGHT - _BOTTOM
@@ -206,9 +222,7 @@ def _draw_lines(points: Sequence[Point], x: _Axis, y: _Axis) -> list[str]:
 
 def _draw_dot(point: Point, x: float, y: float) -> str:
     css = f"dot s{point.series}" + (f" m{point.mark}" if point.mark else "")
-    return (
-        f'<circle class="{css}" cx="{x:.1f}" cy="{y:.1f}" r="5"><title>{escape(point.text)}</title></circle>'
-    )
+    return f'<circle class="{css}" cx="{x:.1f}" cy="{y:.1f}" r="5"><title>{escape(point.text)}</title></circle>'
 
 
 def _draw_names(points: Sequence[Point], x: _Axis, y: _Axis) -> list[str]:
@@ -225,18 +239,24 @@ def _draw_names(points: Sequence[Point], x: _Axis, y: _Axis) -> list[str]:
             at = x(point.x) - 9
             left = at - width
         bottom = y(point.y) - 6
-        if any(left < right and start < left + width and abs(bottom - b) < 12 for start, right, b in taken):
+        if any(
+            left < right and start < left + width and abs(bottom - b) < 12
+            for start, right, b in taken
+        ):
             continue
         taken.append((left, left + width, bottom))
         text = escape(point.label)
-        out.append(f'<text class="name" x="{at:.1f}" y="{bottom:.1f}" text-anchor="{anchor}">{text}</text>')
+        out.append(
+            f'<text class="name" x="{at:.1f}" y="{bottom:.1f}" text-anchor="{anchor}">{text}</text>'
+        )
     return out
 
 
 def draw_legend(series: Sequence[str], marks: Sequence[str] = ()) -> str:
     """Return the legend of colours (methods), and of marks with their names."""
     items = [
-        f'<span><i class="s{i % len(COLORS)}"></i>{escape(name)}</span>' for i, name in enumerate(series)
+        f'<span><i class="s{i % len(COLORS)}"></i>{escape(name)}</span>'
+        for i, name in enumerate(series)
     ]
     items += [f"<span>{escape(mark)}</span>" for mark in marks]
     return f'<p class="legend">{"".join(items)}</p>'

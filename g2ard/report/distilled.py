@@ -62,10 +62,14 @@ class Drawn:
         self._scored: dict[_Key, str] = {}
         for part in parts:
             self._scored |= {_identify(view): view.kind for view in part.cameras}
-        self._worst: dict[str, list[tuple[float, _Key]]] = {kind: [] for kind in self._scored.values()}
+        self._worst: dict[str, list[tuple[float, _Key]]] = {
+            kind: [] for kind in self._scored.values()
+        }
         self._kept: dict[_Key, dict[str, tuple[Bytes, float]]] = {}
 
-    def keep(self, scene: str, targets: Targets, view: int, score: ViewScore, image: Float32) -> None:
+    def keep(
+        self, scene: str, targets: Targets, view: int, score: ViewScore, image: Float32
+    ) -> None:
         """Keep a scene's picture and PSNR if the report may show the view; the result is scored first."""
         key = _identify(targets.cameras[view])
         wanted = key in self._shown or key in self._kept
@@ -79,7 +83,10 @@ class Drawn:
             self._kept = {other: kept for other, kept in self._kept.items() if other not in gone}
             wanted = key not in gone
         if wanted:
-            self._kept.setdefault(key, {})[scene] = to_bytes(grey_unscored(image, targets, view)), score.psnr
+            self._kept.setdefault(key, {})[scene] = (
+                to_bytes(grey_unscored(image, targets, view)),
+                score.psnr,
+            )
 
     def of(self, targets: Targets, view: int) -> Mapping[str, tuple[Bytes, float]]:
         """Return the picture and PSNR of each scene that is kept of a view."""
@@ -126,10 +133,14 @@ def draw_pictures(
         target = over_sky(target, np.clip(light, 0, 1))
         renders = [seen_on_sky(renderer.render(camera)) for renderer in renderers.values()]
         shown = [to_bytes(grey_unscored(image, targets, view)) for image in renders]
-    return Pictures(targets.cameras.names[view], to_bytes(grey_unscored(target, targets, view)), shown, psnrs)
+    return Pictures(
+        targets.cameras.names[view], to_bytes(grey_unscored(target, targets, view)), shown, psnrs
+    )
 
 
-def create_renderers(scenes: Sequence[tuple[str, Splats]], background: Colour = BLACK) -> dict[str, Renderer]:
+def create_renderers(
+    scenes: Sequence[tuple[str, Splats]], background: Colour = BLACK
+) -> dict[str, Renderer]:
     """Return a renderer for each scene by its name."""
     return {name: Renderer(splats, background=background) for name, splats in scenes}
 
@@ -193,7 +204,9 @@ def write_distill_report(
         page.paragraph(line, warns=line.startswith("warning"))
     lost = _find_worsened(before, after)
     if lost:
-        page.paragraph(f"Views that ended below their start: {', '.join(text for _, text in lost)}.")
+        page.paragraph(
+            f"Views that ended below their start: {', '.join(text for _, text in lost)}."
+        )
     shown = _choose_worst(after)
     if lost and lost[0][0] not in shown:
         shown = [lost[0][0], *shown][:_SHOWN]
@@ -270,7 +283,9 @@ def summarize_run(report: RunReport) -> str:
     return f"{report.made} reproduce the {what} at {at}; {last}."
 
 
-def _find_worsened(before: Sequence[ViewScore], after: Sequence[ViewScore]) -> list[tuple[int, str]]:
+def _find_worsened(
+    before: Sequence[ViewScore], after: Sequence[ViewScore]
+) -> list[tuple[int, str]]:
     """Return the views whose PSNR fell by over `LOST`, most first, with a text on each.
 
     >>> rows = [ViewScore(30.0, name=name) for name in "ab"]
@@ -294,7 +309,9 @@ def _choose_worst(scores: Sequence[ViewScore]) -> list[int]:
     return [row for row in turns if row is not None][:_SHOWN]
 
 
-def write_preview(path: Path, drawn: Sequence[Pictures], scenes: Sequence[tuple[str, Splats]]) -> None:
+def write_preview(
+    path: Path, drawn: Sequence[Pictures], scenes: Sequence[tuple[str, Splats]]
+) -> None:
     """Write a PNG with a row for each view: target, then each scene with its PSNR.
 
     Small images are enlarged, so that the picture is at least 1,200 pixels wide.

@@ -49,13 +49,17 @@ def name_scenes(paths: Sequence[Path]) -> list[str]:
 def _find_depth(parts: tuple[str, ...]) -> int:
     """Return how many parts of a path, from the last one, hold a name that is not generic."""
     last = max(1, len(parts) - 1)
-    told = (depth for depth in range(1, last) if not _GENERIC.fullmatch(parts[-depth].split(".")[0]))
+    told = (
+        depth for depth in range(1, last) if not _GENERIC.fullmatch(parts[-depth].split(".")[0])
+    )
     return next(told, last)
 
 
 def count_content(count: int, scene: Source | str) -> str:
     """Return a number of points, if the scene is the file of a point cloud, otherwise of Gaussians."""
-    return plural(count, "point" if isinstance(scene, Source) and scene.kind == "points" else "Gaussian")
+    return plural(
+        count, "point" if isinstance(scene, Source) and scene.kind == "points" else "Gaussian"
+    )
 
 
 def label_scenes(

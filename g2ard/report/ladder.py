@@ -157,7 +157,9 @@ def write_ladder(
     for name in dict.fromkeys(rung.worst.name for rung in rungs):
         row = targets.cameras.names.index(name)
         of = ", ".join(rung.label for rung in rungs if rung.worst.name == name)
-        show(f"{name}, worst of {of}", targets, row, [rung.scores.views[row].psnr for rung in rungs])
+        show(
+            f"{name}, worst of {of}", targets, row, [rung.scores.views[row].psnr for rung in rungs]
+        )
     page.write(path, overwrite)
 
 

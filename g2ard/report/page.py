@@ -61,7 +61,10 @@ def find_worst_windows(image: Bytes, target: Bytes) -> list[Window]:
     columns = max(1, int(_WINDOW * width))
     total = np.pad(error, ((1, 0), (1, 0))).cumsum(0).cumsum(1)
     sums = (
-        total[rows:, columns:] - total[:-rows, columns:] - total[rows:, :-columns] + total[:-rows, :-columns]
+        total[rows:, columns:]
+        - total[:-rows, columns:]
+        - total[rows:, :-columns]
+        + total[:-rows, :-columns]
     )
     found: list[Window] = []
     while len(found) < _CROPS and sums.max() >= 0:
@@ -95,7 +98,9 @@ class Page:
 
     def links(self, files: Mapping[str, str], text: str = "") -> None:
         """Add a line of links to files beside the page, by their texts."""
-        links = (f'<a href="{escape(quote(file))}">{escape(name)}</a>' for name, file in files.items())
+        links = (
+            f'<a href="{escape(quote(file))}">{escape(name)}</a>' for name, file in files.items()
+        )
         self._parts.append(f"<p>{escape(text)}{', '.join(links)}</p>")
 
     def code(self, lines: Iterable[str]) -> None:
@@ -110,7 +115,10 @@ class Page:
         self._parts.append("</details>")
 
     def table(
-        self, columns: Sequence[str], rows: Sequence[Sequence[str]], best: Collection[tuple[int, int]] = ()
+        self,
+        columns: Sequence[str],
+        rows: Sequence[Sequence[str]],
+        best: Collection[tuple[int, int]] = (),
     ) -> None:
         """Add a table; cells (row, column) in `best` are bold."""
         head = "".join(f"<th>{escape(name)}</th>" for name in columns)
@@ -135,7 +143,9 @@ class Page:
             f"<figcaption>{text}</figcaption></figure>"
         )
 
-    def comparison(self, title: str, target: Bytes, shown: Sequence[Shown], name: str = TARGET) -> None:
+    def comparison(
+        self, title: str, target: Bytes, shown: Sequence[Shown], name: str = TARGET
+    ) -> None:
         """Add a view: a slider between the target, with a `name`, and any rendering, and magnified crops.
 
         The first rendering is shown initially, and its worst regions are magnified. Crops keep the resolution
@@ -193,7 +203,9 @@ class Page:
     def text(self) -> str:
         """Return the HTML of the page."""
         images = json.dumps(self._images)
-        style, script = ((_HERE / name).read_text(encoding="utf-8") for name in ("page.css", "page.js"))
+        style, script = (
+            (_HERE / name).read_text(encoding="utf-8") for name in ("page.css", "page.js")
+        )
         return (
             '<!doctype html><html lang="en"><head><meta charset="utf-8">'
             '<meta name="viewport" content="width=device-width,initial-scale=1">'

@@ -55,7 +55,9 @@ def write_registration_report(
     names, *cells = zip(*told_of, strict=True)
     page.table(names, cells)
     page.heading("Least alike first")
-    seen = [(i, row) for i, row in enumerate(found.report.photos) if row.camera_from_world is not None]
+    seen = [
+        (i, row) for i, row in enumerate(found.report.photos) if row.camera_from_world is not None
+    ]
     seen.sort(key=lambda one: -1.0 if one[1].zncc is None else one[1].zncc)
     renderer = Renderer(scene, background=background)
     for i, row in seen[:_VIEWS]:
@@ -89,7 +91,8 @@ def _draw_matches(photo: Bytes, render: Bytes, matches: Float) -> Bytes:
     width = photo.shape[1]
     every = max(1, -(-len(matches) // _LINES))
     for k, (u, v, u_seen, v_seen) in enumerate(matches[::every].tolist()):
-        colour = f"hsl({137 * k % 360}, 90%, 55%)"  # steps of the golden angle, so neighbours differ
+        # steps of the golden angle, so neighbours differ
+        colour = f"hsl({137 * k % 360}, 90%, 55%)"
         pen.line((u, v, width + u_seen, v_seen), fill=colour)
         for x, y in ((u, v), (width + u_seen, v_seen)):
             pen.ellipse((x - 2, y - 2, x + 2, y + 2), outline=colour)

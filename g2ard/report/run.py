@@ -87,7 +87,11 @@ class KindScore(Report):
 
     def as_dict(self) -> dict[str, Any]:
         """Return the report as JSON values, with one change per score."""
-        own = {name: value for name, value in super().as_dict().items() if name not in ("before", "after")}
+        own = {
+            name: value
+            for name, value in super().as_dict().items()
+            if name not in ("before", "after")
+        }
         changes = {name: self.change(name) for name in self.after.scores}
         return own | {name: change and change.as_dict() for name, change in changes.items()}
 
@@ -126,7 +130,11 @@ COLUMNS = ("kind of view", "views", "PSNR, dB", "worst", "detail", "SSIM")
 def list_cells(kinds: Iterable[KindScore]) -> list[list[str]]:
     """Return the rows of a table with `COLUMNS`."""
     return [
-        [kind.kind, str(kind.views), *_list_scores(kind.before, kind.after, f"{kind.worst_psnr.after:.2f}")]
+        [
+            kind.kind,
+            str(kind.views),
+            *_list_scores(kind.before, kind.after, f"{kind.worst_psnr.after:.2f}"),
+        ]
         for kind in kinds
     ]
 
@@ -136,7 +144,9 @@ def _list_scores(before: Scores, after: Scores, worst: str) -> list[str]:
     psnr, detail, ssim = (
         "–"
         if math.isnan(after.scores[name])
-        else " → ".join(f"{scores.scores[name]:.{METRICS[name].digits}f}" for scores in (before, after))
+        else " → ".join(
+            f"{scores.scores[name]:.{METRICS[name].digits}f}" for scores in (before, after)
+        )
         for name in ("psnr", "detail", "ssim")
     )
     return [psnr, worst, detail, ssim]
@@ -274,7 +284,9 @@ class RunReport(Report):
     @property
     def sizes(self) -> str:
         """Sizes of the dense scene, except points found in photos, and of the result."""
-        before, output, file = ((self.bytes[name] or 0) / 1e6 for name in ("input", "output", "file"))
+        before, output, file = (
+            (self.bytes[name] or 0) / 1e6 for name in ("input", "output", "file")
+        )
         start = "" if self.photos else f"{before:.2f} → "
         if self.packed is None:
             return f"{start}{file or output:.2f} MB as .ply"
@@ -330,11 +342,14 @@ def list_remarks(report: RunReport, *, verbose: bool = False) -> list[str]:
         lines.append(describe_idle_regularizers(rounds))
     start = "start" if report.photos else "simplified scene"
     lines += [
-        describe_loss(kind, f"the {start} is better there (--keep writes it too)") for kind in report.kinds
+        describe_loss(kind, f"the {start} is better there (--keep writes it too)")
+        for kind in report.kinds
     ]
     lines.append(gaps_line(report.opacity_lost, RECOVERED_GAPS))
     if report.unseen and report.unseen > _LEAST_UNSEEN:
-        lines.append(f"{report.unseen:.0%} of the scene is in no view: simplified but not recovered")
+        lines.append(
+            f"{report.unseen:.0%} of the scene is in no view: simplified but not recovered"
+        )
     lines += report.warnings or ()
     if report.packed:
         size = report.bytes["file"] or 0
@@ -377,7 +392,9 @@ def describe_loss(kind: KindScore, hint: str) -> str | None:
     if not kind.lost:
         return None
     how = "gained" if psnr > 0 else "lost"
-    return f"{lost} {kind.kind} views lost PSNR; the mean of all {kind.views} {how} {abs(psnr):.2f} dB"
+    return (
+        f"{lost} {kind.kind} views lost PSNR; the mean of all {kind.views} {how} {abs(psnr):.2f} dB"
+    )
 
 
 def score_lines(packed: Packed, size: int, unpacked: float, pixels: str) -> list[str]:

@@ -25,7 +25,10 @@ def draw_contact_sheet(
     heights: list[int] = []
     widths = [0] * max(map(len, rows), default=0)
     for images in rows:
-        cells = [Image.fromarray(np.ascontiguousarray(to_bytes(image))).convert("RGB") for image in images]
+        cells = [
+            Image.fromarray(np.ascontiguousarray(to_bytes(image))).convert("RGB")
+            for image in images
+        ]
         grid.append(cells)
         heights.append(max((cell.height for cell in cells), default=0))
         for c, one in enumerate(cells):

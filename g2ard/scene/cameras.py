@@ -43,7 +43,9 @@ _TUPLE_FIELDS = ("names", "image_paths", "mask_paths", "kinds", "lenses")
 def check_image(width: int, height: int, **fields: Any) -> None:
     """Raise an `InputError` with `fields` for an image of more than `LARGEST_IMAGE` pixels."""
     if width * height > LARGEST_IMAGE:
-        raise InputError(_TOO_LARGE.format(width=width, height=height, limit=LARGEST_IMAGE), **fields)
+        raise InputError(
+            _TOO_LARGE.format(width=width, height=height, limit=LARGEST_IMAGE), **fields
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,7 +177,8 @@ class Cameras(Shown):
     widths: Int
     heights: Int
     names: tuple[str, ...]
-    image_paths: tuple[Path | None, ...] = field(default=(), metadata=UNKEYED)  # targets key the photos
+    # targets key the photos
+    image_paths: tuple[Path | None, ...] = field(default=(), metadata=UNKEYED)
     distortions: Float = field(default_factory=lambda: np.zeros((0, 5)))
     mask_paths: tuple[Path | None, ...] = field(default=(), metadata=UNKEYED)
     source: Path | None = field(default=None, metadata=UNKEYED)
@@ -199,7 +202,9 @@ class Cameras(Shown):
             require(name, count, count == n, str(n))
         if len(set(self.names)) < n:
             twice = next(name for name in self.names if self.names.count(name) > 1)
-            raise InputError(f"{twice!r} is given twice; every view needs its own name", parameter="names")
+            raise InputError(
+                f"{twice!r} is given twice; every view needs its own name", parameter="names"
+            )
         self._check_views()
 
     def _check_views(self) -> None:
@@ -235,7 +240,8 @@ class Cameras(Shown):
         pose = "has a pose that {}; expected a rotation and a translation".format
         return {
             "has a pose or intrinsics that are not finite": ~np.isfinite(largest),
-            f"has a pose or intrinsics above {_LARGEST_CAMERA_VALUE:.0e}": largest > _LARGEST_CAMERA_VALUE,
+            f"has a pose or intrinsics above {_LARGEST_CAMERA_VALUE:.0e}": largest
+            > _LARGEST_CAMERA_VALUE,
             pose("has another last row than 0 0 0 1"): last_row > _POSE_SLACK,
             pose("skews"): (skew > 2 * _POSE_SLACK * unit) | ~(scales > 0),
             pose("scales by {scale:.4g}"): np.abs(scales - 1) > _POSE_SLACK,
@@ -434,7 +440,9 @@ class Cameras(Shown):
 
     def usual_share(self, points: ArrayLike) -> float:
         """Return the share of (N, 3) world points in a view, as the median over at most 16 views."""
-        shares = [self[view].holds(points).mean() for view in evenly_spaced(len(self), _MEDIAN_VIEWS)]
+        shares = [
+            self[view].holds(points).mean() for view in evenly_spaced(len(self), _MEDIAN_VIEWS)
+        ]
         return float(np.median(shares))
 
     def recentred(self, offset: ArrayLike) -> Cameras:

@@ -33,7 +33,9 @@ def fulfilling(splats: Splats, condition: str) -> Mask:
     return holds(condition, ATTRIBUTES, partial(attribute, splats), len(splats))
 
 
-def holds(condition: str, names: Sequence[str], column: Callable[[str], Values], count: int) -> Mask:
+def holds(
+    condition: str, names: Sequence[str], column: Callable[[str], Values], count: int
+) -> Mask:
     """Return the (count,) mask of rows that fulfil a condition, see `fulfilling`.
 
     Args:
@@ -61,7 +63,9 @@ def names_in(condition: str) -> set[str]:
     >>> sorted(names_in("abs(x) < 2 and classification == 2"))
     ['classification', 'x']
     """
-    return {node.id for node in ast.walk(_parse(condition)) if isinstance(node, ast.Name)} - {*_FUNCTIONS}
+    return {node.id for node in ast.walk(_parse(condition)) if isinstance(node, ast.Name)} - {
+        *_FUNCTIONS
+    }
 
 
 def check_condition(condition: str) -> None:
@@ -117,7 +121,9 @@ def _evaluate(node: ast.expr, columns: _Columns) -> Any:
         case ast.UnaryOp(op, operand) if type(op) in _SIGNS:
             return _SIGNS[type(op)](_evaluate_number(operand, columns))
         case ast.BinOp(left, op, right) if type(op) in _ARITHMETIC:
-            return _ARITHMETIC[type(op)](_evaluate_number(left, columns), _evaluate_number(right, columns))
+            return _ARITHMETIC[type(op)](
+                _evaluate_number(left, columns), _evaluate_number(right, columns)
+            )
         case ast.Compare(left, ops, others) if all(type(op) in _COMPARISONS for op in ops):
             values = [_evaluate_number(one, columns) for one in (left, *others)]
             holding = []

@@ -11,9 +11,11 @@ from numpy.typing import NDArray
 
 from g2ard.arrays import Float, Float32, Rows
 
-_SAMPLE_SIGMAS = 4.0  # standard deviations by which a tile may exceed the count estimated from a sample
+# standard deviations by which a tile may exceed the count estimated from a sample
+_SAMPLE_SIGMAS = 4.0
 _HALO_SHARE = 0.03  # margin of a halo as a fraction of a tile's side
-_BOX_PERCENTILES = 1, 99  # percentiles that bound a box when its sides are measured, to ignore floaters
+# percentiles that bound a box when its sides are measured, to ignore floaters
+_BOX_PERCENTILES = 1, 99
 
 
 @dataclass(frozen=True)

@@ -94,7 +94,9 @@ def _is_finite(splats: Splats) -> bool:
     """Return whether a scene has rows and all are finite; infinite logits count as finite."""
     if not len(splats) or np.isnan(splats.logit_opacities).any():
         return False
-    return all(map(_are_finite, (splats.means, splats.quats, splats.scales, splats.sh0, splats.shN)))
+    return all(
+        map(_are_finite, (splats.means, splats.quats, splats.scales, splats.sh0, splats.shN))
+    )
 
 
 def with_some_opacity(scene: PreparedScene) -> PreparedScene:

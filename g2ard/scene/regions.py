@@ -35,11 +35,14 @@ def check_region(region: Sequence[float]) -> Region:
     numbers = tuple(float(value) for value in region)
     if len(numbers) not in (4, 6) or not all(map(math.isfinite, numbers)):
         raise InputError(
-            f"expected X,Y,Z,R or X,Y,Z,X,Y,Z, got {', '.join(f'{n:g}' for n in numbers)}", parameter="region"
+            f"expected X,Y,Z,R or X,Y,Z,X,Y,Z, got {', '.join(f'{n:g}' for n in numbers)}",
+            parameter="region",
         )
     if len(numbers) == 4 and not numbers[3] > 0:
         raise InputError(f"expected a radius > 0, got {numbers[3]:g}", parameter="region")
-    if len(numbers) == 6 and not all(low < high for low, high in zip(numbers[:3], numbers[3:], strict=True)):
+    if len(numbers) == 6 and not all(
+        low < high for low, high in zip(numbers[:3], numbers[3:], strict=True)
+    ):
         raise InputError("empty box; the lower corner comes first", parameter="region")
     return numbers
 

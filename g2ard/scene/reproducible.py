@@ -235,7 +235,8 @@ def canonical_order(splats: Splats, rows: Values, most: int | None = None) -> Va
     if tied.any():
         among = order[tied]
         at = rows[among]
-        columns = [*splats.scales[at].T, *splats.means[at].T[::-1], key[among]]  # the last counts first
+        # the last counts first
+        columns = [*splats.scales[at].T, *splats.means[at].T[::-1], key[among]]
         order[tied] = among[np.lexsort(columns)]
     return order[:most]
 

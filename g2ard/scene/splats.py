@@ -22,7 +22,8 @@ SH_C0 = 0.28209479177387814
 DRAWN_LOGIT = -5.54
 """Logit below which α < 1/255, which no renderer draws."""
 
-_UNIT_SLACK = 1e-6  # deviation of a quaternion's length from 1 that counts as rounding: a few ulps of float32
+# deviation of a quaternion's length from 1 that counts as rounding: a few ulps of float32
+_UNIT_SLACK = 1e-6
 _FINE_STEP = 1e-4  # rounding of positions that nothing shows, as a share of a Gaussian's scale
 _COLOR_SLACK = 1e-5  # excess of a colour over [0, 1] that counts as rounding
 
@@ -86,7 +87,12 @@ class Splats(Shown):
         is_point = offset.shape == (3,) and bool(np.isfinite(offset).all())
         require("offset", self.offset, is_point, "3 finite numbers")
         object.__setattr__(self, "offset", offset)
-        require("means", self.means.shape, self.means.ndim == 2 and self.means.shape[1] == 3, "shape (N, 3)")
+        require(
+            "means",
+            self.means.shape,
+            self.means.ndim == 2 and self.means.shape[1] == 3,
+            "shape (N, 3)",
+        )
         n = len(self.means)
         rest = self.shN.shape[1] if self.shN.ndim == 3 else -1
         for name, shape in (
@@ -275,7 +281,8 @@ def scene_of(scene: Splats | HasSplats, parameter: str = "splats") -> Splats:
     found = scene if isinstance(scene, Splats) else getattr(scene, "splats", None)
     if not isinstance(found, Splats):
         raise InputError(
-            f"expected Splats or a result with splats, got {type(scene).__name__}", parameter=parameter
+            f"expected Splats or a result with splats, got {type(scene).__name__}",
+            parameter=parameter,
         )
     return found
 
@@ -284,7 +291,9 @@ def _as_floats(name: str, values: Any, kind: type[Any] | None = None) -> Values:
     """Return an array as float32; as `kind`, if given; means of more than 24 bits as float64."""
     dtype = getattr(values, "dtype", None)
     if kind is None:
-        kind = np.float64 if name == "means" and dtype not in (np.float32, np.float16) else np.float32
+        kind = (
+            np.float64 if name == "means" and dtype not in (np.float32, np.float16) else np.float32
+        )
     if isinstance(values, np.ndarray) and dtype == kind:
         return values
     try:

@@ -224,7 +224,9 @@ def similarity(matrix: ArrayLike) -> tuple[float, Float, Float]:
         )
     det = float(np.linalg.det(m[:3, :3]))
     if det <= 0:
-        raise InputError(f"mirrors or flattens the scene (its determinant is {det:g})", parameter="transform")
+        raise InputError(
+            f"mirrors or flattens the scene (its determinant is {det:g})", parameter="transform"
+        )
     scale = det ** (1 / 3)
     rotation = m[:3, :3] / scale
     if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4):

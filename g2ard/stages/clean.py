@@ -98,7 +98,9 @@ def find_clutter(
         InputError: an unknown kind, or `seen` or `unoccluded` of another length.
     """
     if unknown := sorted(set(kinds) - set(KINDS)):
-        raise InputError(f"expected some of {', '.join(KINDS)}, got {unknown[0]!r}", parameter="kinds")
+        raise InputError(
+            f"expected some of {', '.join(KINDS)}, got {unknown[0]!r}", parameter="kinds"
+        )
     for name, rows in (("seen", seen.weight), ("unoccluded", unoccluded)):
         require(name, len(rows), len(rows) == len(splats), f"{len(splats)} rows")
     kind = np.full(len(splats), -1, np.int8)
@@ -257,7 +259,9 @@ def _find_elongated(splats: Splats, rows: Rows) -> tuple[Rows, Float]:
     width, length = longer_axes(splats.scales[rows].astype(np.float64)).T
     long = rows[length > NEEDLE_LENGTH * np.maximum(width, 1e-30)]
     axis = np.argmax(splats.scales[long], axis=1)
-    along = np.take_along_axis(rotation_matrices(splats.quats[long]), axis[:, None, None], axis=2)[:, :, 0]
+    along = np.take_along_axis(rotation_matrices(splats.quats[long]), axis[:, None, None], axis=2)[
+        :, :, 0
+    ]
     return long, 2 * splats.scales[long, axis].astype(np.float64)[:, None] * along
 
 

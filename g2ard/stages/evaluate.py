@@ -47,7 +47,9 @@ class Scores(Report):
         return {name: getattr(self, name) for name in METRICS}
 
     @classmethod
-    def mean(cls, scores: Sequence[Scores], average: Callable[[Any], Any] = np.mean, **further: Any) -> Self:
+    def mean(
+        cls, scores: Sequence[Scores], average: Callable[[Any], Any] = np.mean, **further: Any
+    ) -> Self:
         """Return the means of several scores, with further fields."""
         means = {name: float(average([getattr(each, name) for each in scores])) for name in METRICS}
         return cls(**means, **further)
@@ -106,7 +108,9 @@ class Evaluation(Means):
     @property
     def lpips(self) -> dict[str, float]:
         """Mean of the views' LPIPS, by network."""
-        return {net: float(np.mean([v.lpips[net] for v in self.views])) for net in self.views[0].lpips}
+        return {
+            net: float(np.mean([v.lpips[net] for v in self.views])) for net in self.views[0].lpips
+        }
 
     @property
     def means(self) -> Means:

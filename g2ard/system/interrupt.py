@@ -12,7 +12,8 @@ import signal
 import sys
 import time
 
-TYPE_CHECKING = False  # this is the program's first import, and importing typing is slow enough to interrupt
+# this is the program's first import, and importing typing is slow enough to interrupt
+TYPE_CHECKING = False
 if TYPE_CHECKING:
     from types import FrameType
     from typing import Any, NoReturn
@@ -47,7 +48,10 @@ def terminate(number: int, frame: FrameType | None) -> NoReturn:
 
 def ends_the_program() -> None:
     """Make both signals end the process with one line, unless another handler is installed."""
-    for number, default in ((signal.SIGINT, signal.default_int_handler), (signal.SIGTERM, signal.SIG_DFL)):
+    for number, default in (
+        (signal.SIGINT, signal.default_int_handler),
+        (signal.SIGTERM, signal.SIG_DFL),
+    ):
         if signal.getsignal(number) is default:
             signal.signal(number, _end_process)
 
@@ -63,9 +67,13 @@ class RaisesInterrupt:
     """
 
     def __enter__(self) -> None:
-        self._replaced = [n for n in (signal.SIGINT, signal.SIGTERM) if signal.getsignal(n) is _end_process]
+        self._replaced = [
+            n for n in (signal.SIGINT, signal.SIGTERM) if signal.getsignal(n) is _end_process
+        ]
         for number in self._replaced:
-            signal.signal(number, signal.default_int_handler if number == signal.SIGINT else terminate)
+            signal.signal(
+                number, signal.default_int_handler if number == signal.SIGINT else terminate
+            )
         self._report = sys.unraisablehook
         self._again = False
         if self._replaced:
@@ -98,7 +106,8 @@ def leave() -> NoReturn:
     end even a program that has handled it by the signal; `os._exit` avoids that.
     """
     if (shared := sys.modules.get("multiprocessing.util")) is not None:
-        shared._run_finalizers(0)  # release semaphores, or the resource tracker reports them as leaked
+        # release semaphores, or the resource tracker reports them as leaked
+        shared._run_finalizers(0)
     sys.stdout.flush()
     sys.stderr.flush()
     os._exit(status())

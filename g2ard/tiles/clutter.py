@@ -7,7 +7,15 @@ import numpy as np
 from g2ard.rendering.renderer import settings_for
 from g2ard.rendering.visibility import visibility
 from g2ard.stages.clean import compare_depths, find_clutter
-from g2ard.tiles.tasks import Arrays, Given, cameras_of, cropped, telling, tile_of, with_surroundings
+from g2ard.tiles.tasks import (
+    Arrays,
+    Given,
+    cameras_of,
+    cropped,
+    telling,
+    tile_of,
+    with_surroundings,
+)
 
 
 def clutter(given: Given) -> Arrays:

@@ -136,7 +136,9 @@ class InTiles:
         drawn.fill(progress)
         return shifted(small, chosen, shown, self.settings, progress)
 
-    def images(self, views: Cameras, background: Colour = BLACK, limit: int = CACHE_BYTES) -> Targets:
+    def images(
+        self, views: Cameras, background: Colour = BLACK, limit: int = CACHE_BYTES
+    ) -> Targets:
         """Return the scene's images in some views."""
         return TileRenders(self, views, background, min(limit, _KEPT_BYTES))
 

@@ -236,7 +236,9 @@ class _Pool:
         self._lanes.setdefault(worker.lanes, worker.host)
         if len(self._lanes) > 1:
             told = " and ".join(f"{lanes} on {host}" for lanes, host in self._lanes.items())
-            raise InputError(f"workers compute with {told}, whose last bits differ; use workers of one kind")
+            raise InputError(
+                f"workers compute with {told}, whose last bits differ; use workers of one kind"
+            )
 
     def close(self) -> None:
         """Cancel unfinished tasks, and kill the processes of this pool."""

@@ -37,7 +37,9 @@ def wide(given: Given) -> Arrays:
     """
     store = TileStore.open(given["store"])
     scene = store.read(given["tile"])
-    return arrays_of(scene.take(_WIDTHS * scene.scales.max(axis=1, initial=0) > store.margin / 2), "scene")
+    return arrays_of(
+        scene.take(_WIDTHS * scene.scales.max(axis=1, initial=0) > store.margin / 2), "scene"
+    )
 
 
 def draw(given: Given) -> Arrays:
@@ -72,14 +74,18 @@ def draw(given: Given) -> Arrays:
             del ways[view][0]
         tell_share(1 - sum(map(len, ways)) / (len(ways) * len(boxes)))
     finished = (canvas.finished(given["background"]) for canvas in canvases)
-    return {str(n): _stored(image, given["opacity"]) for n, image in zip(numbers, finished, strict=True)}
+    return {
+        str(n): _stored(image, given["opacity"]) for n, image in zip(numbers, finished, strict=True)
+    }
 
 
 def _stored(drawn: Float32, opacity: bool) -> Values:
     return drawn if opacity else rounded(np.clip(drawn[..., :3], 0, 1))
 
 
-def reaching_into(store: TileStore, tile: int, cameras: Cameras, wide_files: Sequence[Path]) -> Splats:
+def reaching_into(
+    store: TileStore, tile: int, cameras: Cameras, wide_files: Sequence[Path]
+) -> Splats:
     """Return a tile's Gaussians, and those of others that may have a pixel in its box in some view."""
     box = store.tree.boxes()[tile] + store.offset
     low, high = (np.array([getattr(one, end) for one in store.tiles]) for end in ("low", "high"))

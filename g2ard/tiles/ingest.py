@@ -214,7 +214,8 @@ def _made(folder: Path) -> list[Path]:
     foreign = sorted(name for name in names if not (is_tile_file(name) or name == LOCK))
     if foreign:
         raise OutputError(
-            f"holds {foreign[0]}, which does not belong to tiles; choose another folder", path=folder
+            f"holds {foreign[0]}, which does not belong to tiles; choose another folder",
+            path=folder,
         )
     return made
 

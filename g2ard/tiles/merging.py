@@ -46,7 +46,9 @@ class Merged:
     @property
     def protected(self) -> Mask | None:
         """(M,) protection flags, if the method has them."""
-        flags = [load(path, "protected")[0] for path in self.files if path.name.startswith("reduce")]
+        flags = [
+            load(path, "protected")[0] for path in self.files if path.name.startswith("reduce")
+        ]
         return np.concatenate(flags) if flags else None
 
     def parents(self, scene: SceneStream) -> Int:
@@ -59,7 +61,9 @@ class Merged:
         counts = self.report.tiles or rows
         parents = [load(path, "parents")[0] for path in self.files] or [np.arange(n) for n in rows]
         before = np.cumsum([0, *counts])[:-1]
-        moved = [np.where(own < 0, -1, own + np.int64(n)) for own, n in zip(parents, before, strict=True)]
+        moved = [
+            np.where(own < 0, -1, own + np.int64(n)) for own, n in zip(parents, before, strict=True)
+        ]
         if scene.identity() == [self.store.key]:
             return np.concatenate(moved)
         out = np.empty(self.store.count, np.int64)
@@ -96,7 +100,8 @@ def simplify_tiles(
     store = run.store
     if not 1 <= budget <= store.count:
         raise InputError(
-            f"expected 1 to {store.count:,} (the scene's Gaussians), got {budget:,}", parameter="budget"
+            f"expected 1 to {store.count:,} (the scene's Gaussians), got {budget:,}",
+            parameter="budget",
         )
     if budget == store.count:
         whole = scene_in_tiles(store, run.sizes, store.read, key_of(store.key), store.sh_degree)
@@ -105,7 +110,9 @@ def simplify_tiles(
     sights = None if views is None else Sights(run, views, frame)
     if isinstance(run.method, Paper):
         counts = shares(run.sizes, budget)
-        merged = _reduced(run, counts, shares(run.sizes, final_budget or budget), [{}] * len(counts))
+        merged = _reduced(
+            run, counts, shares(run.sizes, final_budget or budget), [{}] * len(counts)
+        )
     else:
         merged, counts = _merged(run, budget, frame if sights is None else sights.frame, sights)
     if sights is None:
@@ -113,7 +120,9 @@ def simplify_tiles(
         mean = None
     else:
         seen = sights.again(merged)
-        files = [{"merged": one, "visibility": other} for one, other in zip(merged, seen, strict=True)]
+        files = [
+            {"merged": one, "visibility": other} for one, other in zip(merged, seen, strict=True)
+        ]
         mean = sum(float(load(path, "wanted")[0].sum()) for path in merged) / budget
 
     def tile(i: int) -> Splats:
@@ -174,7 +183,9 @@ def _merged(
     if run.has_own_steps:
         counts = shares([n + f for n, f in zip(runs_left, faint, strict=True)], budget)
         return _reduced(run, counts, counts, seen), counts
-    for one, path, runs, end in zip(given, costs, runs_left, plan_ends(runs_left, budget), strict=True):
+    for one, path, runs, end in zip(
+        given, costs, runs_left, plan_ends(runs_left, budget), strict=True
+    ):
         one |= {"costs": path, "runs": runs, "last": end}
     plans = run.each(pair_plan, "plans", given)
     merges = cheapest([_costs_of(path) for path in plans], sum(runs_left) + sum(faint) - budget)
@@ -208,7 +219,10 @@ def shares(sizes: Sequence[int], budget: int) -> list[int]:
     total = sum(sizes)
     if budget < tiles:
         raise _unreached(tiles, budget, tiles, "one per tile")
-    ends = [rows * (budget - tiles) // max(1, total - tiles) for rows in accumulate(n - 1 for n in sizes)]
+    ends = [
+        rows * (budget - tiles) // max(1, total - tiles)
+        for rows in accumulate(n - 1 for n in sizes)
+    ]
     return [1 + end - begin for begin, end in pairwise([0, *ends])]
 
 
@@ -236,7 +250,8 @@ def plan_ends(runs: Sequence[int], budget: int) -> list[int]:
     """
     share = _PLAN_DEPTH_SHARE * min(1.0, budget / sum(runs))
     ends = [max(1, round(share * n)) for n in runs]
-    if sum(ends) > budget:  # few Gaussians per tile: all have one, and shares of the rest are rounded down
+    # few Gaussians per tile: all have one, and shares of the rest are rounded down
+    if sum(ends) > budget:
         share = _PLAN_DEPTH_SHARE * (budget - len(runs)) / max(1, sum(runs) - len(runs))
         ends = [1 + int(share * (n - 1)) for n in runs]
     return ends

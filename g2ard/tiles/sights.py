@@ -60,7 +60,9 @@ class Sights:
         if np.isfinite(pixels).any():
             known = np.isfinite(pixels)
             pixel = weighted_quantile(pixels[known], np.array(run.sizes)[known], 0.5)
-            self.frame = tuple(_core.TileFrame(*frame).with_views(pixel, *map(float, sums)).values())
+            self.frame = tuple(
+                _core.TileFrame(*frame).with_views(pixel, *map(float, sums)).values()
+            )
 
     def again(self, merged: list[Path]) -> list[Path]:
         """Measure what the same views see of the merged tiles."""

@@ -138,7 +138,9 @@ def visibility(given: Given) -> Arrays:
     own = tile_of(given, sh=False)
     cameras = cameras_of(given["cameras"]).recentred(own.offset)
     here = cameras.take(given["views"])
-    distance = np.median(np.linalg.norm(here.positions - own.core.origin, axis=1)) if len(here) else 0.0
+    distance = (
+        np.median(np.linalg.norm(here.positions - own.core.origin, axis=1)) if len(here) else 0.0
+    )
     settings = RasterSettings(antialiased=own.antialiased, near=NEAR * float(distance) or None)
     here = cropped(here, own, settings)
     amid = with_surroundings(own, given)
@@ -214,7 +216,12 @@ def pair_plan(given: Given) -> Arrays:
     counts = config.rounds(runs, last)
     tile = _seen_tile(scene, given)
     of, a, b, costs = tile.plan(runs, counts, load(given["costs"], "costs")[0])
-    return {"of": of, "a": a, "b": b, "costs": np.maximum.accumulate(costs) if len(costs) else costs}
+    return {
+        "of": of,
+        "a": a,
+        "b": b,
+        "costs": np.maximum.accumulate(costs) if len(costs) else costs,
+    }
 
 
 def merge(given: Given) -> Arrays:
@@ -274,7 +281,9 @@ def reduce(given: Given) -> Arrays:
     return made | {"protected": done.protected}
 
 
-def _merged(scene: PreparedScene, small: Splats, parents: Values, clamped: int, given: Given) -> Arrays:
+def _merged(
+    scene: PreparedScene, small: Splats, parents: Values, clamped: int, given: Given
+) -> Arrays:
     """Return what `merge` returns; sums do not depend on the order of the tile's rows."""
     of = parents[scene.core.order]
     kept = of >= 0
@@ -306,14 +315,20 @@ def merged_visibility(given: Given) -> Arrays:
 
 
 def _of_others(
-    own: PreparedScene, amid: PreparedScene, cameras: Cameras, settings: RasterSettings, given: Given
+    own: PreparedScene,
+    amid: PreparedScene,
+    cameras: Cameras,
+    settings: RasterSettings,
+    given: Given,
 ) -> Float32:
     """Return the weighted Σ αT² of a tile's Gaussians over views of other kinds."""
     weight = np.float32(given["others_weight"])
     return weight * _sum_of(own, amid, cameras.take(given["others"]), settings)
 
 
-def _sum_of(own: PreparedScene, amid: PreparedScene, cameras: Cameras, settings: RasterSettings) -> Float32:
+def _sum_of(
+    own: PreparedScene, amid: PreparedScene, cameras: Cameras, settings: RasterSettings
+) -> Float32:
     """Return Σ αT² of a tile's Gaussians, the first ones of `amid`, over views."""
     if not len(cameras):
         return np.zeros(len(own), np.float32)
@@ -330,7 +345,10 @@ def _config(given: Given) -> Pairs:
 
 
 def _merging(
-    scene: PreparedScene, config: Pairs, frame: _core.TileFrame, visibility: SampledVisibility | None
+    scene: PreparedScene,
+    config: Pairs,
+    frame: _core.TileFrame,
+    visibility: SampledVisibility | None,
 ) -> _core.TileMerging:
     seen = None if visibility is None else emphasised(scene, visibility, config)
     return _core.TileMerging(scene.core, frame, config, seen)
@@ -379,14 +397,17 @@ class TiledRun:
         self.config = asdict(merging.resolved(antialiased=store.render_model == "antialiased"))
         self.sizes = [tile.rows for tile in store.tiles]
         self._common: list[dict[str, Any]] = [
-            {"content": store.key, "tile": tile, "config": self.config} for tile in range(len(self.sizes))
+            {"content": store.key, "tile": tile, "config": self.config}
+            for tile in range(len(self.sizes))
         ]
         sampled = {"sampled": sample_stride(store.count)}
         self.coarse = self.each(coarse, "coarse", [sampled] * len(self.sizes))
         for common, path in zip(self._common, self.coarse, strict=True):
             common["own"] = path
 
-    def each(self, function: Callable[[Given], Arrays], stage: str, per_tile: Iterable[Given]) -> list[Path]:
+    def each(
+        self, function: Callable[[Given], Arrays], stage: str, per_tile: Iterable[Given]
+    ) -> list[Path]:
         """Run a function for each tile; `per_tile` is what it gets besides what belongs to the tile."""
         given = ({**common, **own} for common, own in zip(self._common, per_tile, strict=True))
         calls = zip(given, self.sizes, strict=True)

@@ -33,7 +33,16 @@ Arrays = dict[str, Values]
 Given = Mapping[str, Any]
 """Parameter of a task's function: what is given to it, by name, see `Task`."""
 
-_SCENE_ARRAYS = ("means", "quats", "scales", "logit_opacities", "sh0", "shN", "offset", "render_model")
+_SCENE_ARRAYS = (
+    "means",
+    "quats",
+    "scales",
+    "logit_opacities",
+    "sh0",
+    "shN",
+    "offset",
+    "render_model",
+)
 
 _TELL: ContextVar[Callable[[float], None]] = ContextVar("tell", default=lambda share: None)
 """Takes the finished share of the task that runs."""
@@ -49,7 +58,14 @@ _CROP_MARGIN = 8
 _OUTPUT_VERSION = 5
 """Version of the functions' output; raise it when a change makes earlier files unusable."""
 
-_CORRUPT_FILE_ERRORS = (zipfile.BadZipFile, zlib.error, ValueError, EOFError, LookupError, RuntimeError)
+_CORRUPT_FILE_ERRORS = (
+    zipfile.BadZipFile,
+    zlib.error,
+    ValueError,
+    EOFError,
+    LookupError,
+    RuntimeError,
+)
 """Exceptions that numpy and zipfile raise for corrupt files."""
 
 
@@ -178,7 +194,8 @@ def load(path: Path, *names: str) -> list[Values]:
             return [arrays[name] for name in names]
     except _CORRUPT_FILE_ERRORS as error:
         raise InputError(
-            "its contents changed after writing; remove it and run the same command again", path=path
+            "its contents changed after writing; remove it and run the same command again",
+            path=path,
         ) from error
 
 

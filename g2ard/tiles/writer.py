@@ -133,13 +133,17 @@ class Pouring:
             parts = self._cut_again(files)
             if not parts:
                 return tree, files
-            self.say(f"{plural(len(parts), 'tile')} hold more than {self.tile_rows:,} rows; cutting again")
+            self.say(
+                f"{plural(len(parts), 'tile')} hold more than {self.tile_rows:,} rows; cutting again"
+            )
             refined = _load_tree(tree)[0].refined(parts)
             tree = self._save_tree(refined, margin_of(refined, self._sample()[0]))
             for path in files:
                 path.unlink()
 
-    def _run_parts(self, function: Callable[[Given], Arrays], stage: str, given: Given) -> list[Path]:
+    def _run_parts(
+        self, function: Callable[[Given], Arrays], stage: str, given: Given
+    ) -> list[Path]:
         """Run a function that reads the stream on each part."""
         rows = self.rows or max(1, _PART_BYTES // row_bytes(self.stream))
         calls = [
@@ -261,7 +265,9 @@ class Pouring:
         for path, box in zip(written, boxes if some is None else boxes[some], strict=True):
             (rows, halo), checks = (array.tolist() for array in load(path, "rows", "checks"))
             corners = np.clip(box, low, high).tolist()
-            tiles.append({"rows": rows, "halo": halo, "low": corners[0], "high": corners[1], "crc32": checks})
+            tiles.append(
+                {"rows": rows, "halo": halo, "low": corners[0], "high": corners[1], "crc32": checks}
+            )
         return tiles
 
     def finish(self, tree: Path, tiles: list[Named], manifest: Named) -> None:
@@ -288,7 +294,11 @@ class Pouring:
 
 def row_bytes(stream: Stream) -> int:
     """Return the bytes of a Gaussian or of a point to be lifted, which begin with its float32 position."""
-    return 4 * row_width(stream.sh_degree) if isinstance(stream, SceneStream) else _POINT_DTYPE.itemsize
+    return (
+        4 * row_width(stream.sh_degree)
+        if isinstance(stream, SceneStream)
+        else _POINT_DTYPE.itemsize
+    )
 
 
 def _can_be_sent(stream: Stream) -> bool:
@@ -433,7 +443,10 @@ def gathered(given: Given) -> Arrays:
     low = np.full(3, np.inf)
     high = np.full(3, -np.inf)
     for kind, (which, name) in enumerate((("core", tile_name(tile)), ("halo", halo_name(tile)))):
-        with atomic_output(folder / PARTS / name, overwrite=True) as temporary, temporary.open("wb") as file:
+        with (
+            atomic_output(folder / PARTS / name, overwrite=True) as temporary,
+            temporary.open("wb") as file,
+        ):
             for path in given[which]:
                 (rows,) = load(path, name)
                 file.write(data := np.ascontiguousarray(rows).view(np.uint8).data)

@@ -96,7 +96,8 @@ def room_for_scene(size: int) -> int:
     room = (size - len(_fill_page(["?" * 100], {}, []).encode()) - 1000) * 3 // 4
     if room <= 0:
         raise InputError(
-            f"{size:,} bytes are too few; the viewer takes {size - room * 4 // 3:,}", parameter="fit"
+            f"{size:,} bytes are too few; the viewer takes {size - room * 4 // 3:,}",
+            parameter="fit",
         )
     return room
 
@@ -121,7 +122,10 @@ def write_stream_page(
         "background": _list_channels(background),
         "files": ["lod-meta.json"],
         "antialiased": [antialiased],
-        "placed": {"rotation": [float(q) for q in rotation], "position": [float(x) for x in position]},
+        "placed": {
+            "rotation": [float(q) for q in rotation],
+            "position": [float(x) for x in position],
+        },
     }
     return _write(Path(path), _fill_page([title], shown, []), overwrite=True)
 

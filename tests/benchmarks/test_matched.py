@@ -55,7 +55,9 @@ def test_every_cell_gets_the_same_budget_steps_and_views(tmp_path: Path) -> None
     out = tmp_path / "out"
     rows = run_studies([made], out)
     assert [(r["method"], r["matched"]) for r in rows] == [
-        (name, kind) for name in ("g2ard", "pup", "rounds", "nanogs") for kind in ("steps", "seconds")
+        (name, kind)
+        for name in ("g2ard", "pup", "rounds", "nanogs")
+        for kind in ("steps", "seconds")
     ]
     for row in rows:
         assert "error" not in row, row
@@ -111,11 +113,17 @@ def test_a_reduction_that_uses_all_the_time_is_scored_without_recovery(tmp_path:
 
 @needs_processes
 def test_a_city_is_made_lifted_trained_and_adapted_and_its_teacher_scored(tmp_path: Path) -> None:
-    text = HEAD.replace("[4]", "[4, 8]").replace("12", "4") + 'methods = ["g2ard", "lifted", "teacher"]\n'
+    text = (
+        HEAD.replace("[4]", "[4, 8]").replace("12", "4")
+        + 'methods = ["g2ard", "lifted", "teacher"]\n'
+    )
     text += 'adapt_steps = 3\n[method.lifted]\nprior = "lift"\npolicy = "random"\nk = 0.5\n'
     made, rows, out = run(tmp_path, text + CITY)
     teachers = [row for row in rows if row["method"] == "teacher"]
-    others, splits = [row for row in rows if row["method"] != "teacher"], ("val", "ood", "adapt-val")
+    others, splits = (
+        [row for row in rows if row["method"] != "teacher"],
+        ("val", "ood", "adapt-val"),
+    )
     assert {(r["ratio"], r["method"], r["prior"], r["split"], r["count"]) for r in others} == {
         (ratio, *method, split, 2000 // ratio)
         for ratio in (4, 8)
@@ -123,7 +131,10 @@ def test_a_city_is_made_lifted_trained_and_adapted_and_its_teacher_scored(tmp_pa
         for split in splits
     }
     assert all(r["against"] == "photos" and r["adapt_cpu_s"] > 0 for r in others)
-    selected, whole = next(out.glob("work/*/stages/*/views.json")), next(out.glob("work/*/train.json"))
+    selected, whole = (
+        next(out.glob("work/*/stages/*/views.json")),
+        next(out.glob("work/*/train.json")),
+    )
     assert len(io.read_views(selected)) == round(len(io.read_views(whole)) / 2)
     assert [(row["split"], row["matched"], row["ratio"], row["steps"]) for row in teachers] == [
         (split, "none", 1.0, 0) for split in splits
@@ -134,7 +145,9 @@ def test_a_city_is_made_lifted_trained_and_adapted_and_its_teacher_scored(tmp_pa
         if row["prior"] == teachers[0]["prior"]:
             assert row["delta_psnr"] == pytest.approx(row["psnr"] - of[row["split"]], abs=1e-4)
     assert len(read_rows(out / "rows.csv")) == len(rows)
-    elsewhere = {name: value for name, value in others[0].items() if name != "delta_psnr"} | {"scene": "moon"}
+    elsewhere = {name: value for name, value in others[0].items() if name != "delta_psnr"} | {
+        "scene": "moon"
+    }
     assert "delta_psnr" not in made.derived([elsewhere, *teachers])[0]
 
 
@@ -169,7 +182,10 @@ def test_legs_are_those_of_the_releases() -> None:
 
 
 def test_a_given_prior_has_the_weights_of_the_kind_that_its_scene_states(tmp_path: Path) -> None:
-    text = HEAD.replace("12", "6") + 'methods = ["a"]\n[method.a]\nbase = "g2ard-paper"\nrounds = "one"\n'
+    text = (
+        HEAD.replace("12", "6")
+        + 'methods = ["a"]\n[method.a]\nbase = "g2ard-paper"\nrounds = "one"\n'
+    )
     for kind in ("noisy", "trained"):
         (folder := tmp_path / kind).mkdir()
         _, _, out = run(folder, f'{text}{SCENE}regularizers = "{kind}"\n')
@@ -182,10 +198,13 @@ def test_policies_continue_from_one_checkpoint(tmp_path: Path) -> None:
     text = HEAD + 'seeds = [0, 1]\nmethods = ["random", "directional", "own"]\n'
     for name, base in (("random", "g2ard-paper"), ("directional", "g2ard-paper"), ("own", "g2ard")):
         policy = "random" if name == "own" else name
-        text += f'[method.{name}]\nbase = "{base}"\npolicy = "{policy}"\nk = 0.5\nshared_start = true\n'
+        text += (
+            f'[method.{name}]\nbase = "{base}"\npolicy = "{policy}"\nk = 0.5\nshared_start = true\n'
+        )
     _, rows, out = run(tmp_path, text + SCENE)
     counts = round_counts(1200, 300)
-    assert len(jobs(out, "reduce")) == len(counts) + 1  # once for all rows, and once for g2ard's own
+    # once for all rows, and once for g2ard's own
+    assert len(jobs(out, "reduce")) == len(counts) + 1
     recoveries = jobs(out, "recover")
     early = [job for job in recoveries if not job["final"]]
     assert len(early) == len(counts) - 1
@@ -204,7 +223,8 @@ def test_scores_are_those_of_evaluate_and_black_renders_are_left_out(tmp_path: P
     assert figures(scored)["psnr"] == evaluate(small, targets).psnr
     assert len(list((tmp_path / "p").iterdir())) == 4
     toward = np.asarray(views.positions[0]) / 3.0
-    hidden = replace(ball, means=(ball.means - 6 * toward).astype(np.float32))  # in the first view alone
+    # in the first view alone
+    hidden = replace(ball, means=(ball.means - 6 * toward).astype(np.float32))
     scored = score(hidden, targets)
     lit = [view["psnr"] for view in scored if not view["black"]]
     assert 0 < len(lit) < 4
@@ -220,7 +240,12 @@ def test_scores_are_those_of_evaluate_and_black_renders_are_left_out(tmp_path: P
 def test_scored_views_are_not_trained_on(tmp_path: Path) -> None:
     views = around(16, size=(48, 36))
     io.write_views(tmp_path / "val.json", views.take(range(4)))
-    text = HEAD.replace("12", "4") + 'methods = ["random"]\n' + SCENE + 'score = { val = "val.json" }\n'
+    text = (
+        HEAD.replace("12", "4")
+        + 'methods = ["random"]\n'
+        + SCENE
+        + 'score = { val = "val.json" }\n'
+    )
     made, (row,), out = run(tmp_path, text)
     assert (row["views"], row["dropped"]) == (4, 4)
     (train,) = out.glob("work/*/train.json")

@@ -27,7 +27,9 @@ def unpack(s: Splats) -> list[dict]:
 def density(g: dict, x: np.ndarray) -> float:
     cov = g["R"] @ np.diag(g["std"] ** 2 + 1e-8) @ g["R"].T
     d = x - g["mean"]
-    return float(np.exp(-0.5 * d @ np.linalg.inv(cov) @ d) / np.sqrt((2 * np.pi) ** 3 * np.linalg.det(cov)))
+    return float(
+        np.exp(-0.5 * d @ np.linalg.inv(cov) @ d) / np.sqrt((2 * np.pi) ** 3 * np.linalg.det(cov))
+    )
 
 
 def merge(a: dict, b: dict) -> tuple[float, dict]:
@@ -60,7 +62,9 @@ def naive(s: Splats, budget: int) -> list[dict]:
     while len(g) > budget:
         edges = set()
         for i, r in enumerate(g):
-            far = sorted((float(((o["mean"] - r["mean"]) ** 2).sum()), j) for j, o in enumerate(g) if j != i)
+            far = sorted(
+                (float(((o["mean"] - r["mean"]) ** 2).sum()), j) for j, o in enumerate(g) if j != i
+            )
             edges |= {(min(i, j), max(i, j)) for _, j in far[:16]}
         ranked = sorted((merge(g[i], g[j])[0], i, j) for i, j in edges)
         used: set[int] = set()
@@ -96,7 +100,9 @@ def test_knn_is_brute_force() -> None:
     points = np.random.default_rng(0).normal(size=(300, 3))
     distance = ((points[:, None] - points) ** 2).sum(-1)
     np.fill_diagonal(distance, np.inf)
-    np.testing.assert_array_equal(_core.knn(points, 9), np.argsort(distance, 1, kind="stable")[:, :9])
+    np.testing.assert_array_equal(
+        _core.knn(points, 9), np.argsort(distance, 1, kind="stable")[:, :9]
+    )
     for k in (0, 300):
         with pytest.raises(InputError, match="k: expected 1 to 299"):
             _core.knn(points, k)

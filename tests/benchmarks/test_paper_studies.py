@@ -81,7 +81,18 @@ def study(
     return run
 
 
-SMALL = ("--set", "released=false", "--ratios", "2", "--seeds", "0", "--set", "steps=20", "--size", "48")
+SMALL = (
+    "--set",
+    "released=false",
+    "--ratios",
+    "2",
+    "--seeds",
+    "0",
+    "--set",
+    "steps=20",
+    "--size",
+    "48",
+)
 
 
 @needs_processes
@@ -108,7 +119,9 @@ def test_every_table_has_rows_on_data_as_it_is_published(
 def test_poses_are_registered_from_aces_file(
     study: Callable[..., tuple[list[dict[str, Any]], str]],
 ) -> None:
-    rows, _ = study("kings_college_registration", "--size", "400", "--only", "teacher,30.3× without eRank")
+    rows, _ = study(
+        "kings_college_registration", "--size", "400", "--only", "teacher,30.3× without eRank"
+    )
     assert [row["scene"] for row in rows] == ["teacher", "30.3× without eRank"]
     for row in rows:
         assert "error" not in row, row
@@ -137,7 +150,9 @@ def steps_of(study: Matched) -> int:
 
 
 def test_the_hours_follow_the_studies() -> None:
-    page = " ".join((ROOT / "docs/datasets.md").read_text(encoding="utf-8").split("## Hours")[1].split())
+    page = " ".join(
+        (ROOT / "docs/datasets.md").read_text(encoding="utf-8").split("## Hours")[1].split()
+    )
     seconds = float(re.findall(r"([\d.]+) CPU seconds", page)[0])
     studies = {name: read_study(DEFINITIONS / "paper" / f"{name}.toml") for name in PAPER}
     matched_studies = {name: study for name, study in studies.items() if isinstance(study, Matched)}

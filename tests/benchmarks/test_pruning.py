@@ -40,15 +40,21 @@ def test_pups_fisher_estimates_the_gram_matrix_of_autograds_jacobian(degree: int
         def image(means: torch.Tensor, log_scales: torch.Tensor, i: int = i, view: Camera = view):
             tensors = [means, fixed[1], log_scales, *fixed[3:]]
             pose, K = (torch.from_numpy(array[i]) for array in (VIEWS.viewmats, VIEWS.Ks))
-            return naive.render(*tensors, viewmat=pose, K=K, width=view.width, height=view.height).image
+            return naive.render(
+                *tensors, viewmat=pose, K=K, width=view.width, height=view.height
+            ).image
 
-        by_mean, by_scale = torch.autograd.functional.jacobian(image, (fixed[0], fixed[2]), vectorize=True)
+        by_mean, by_scale = torch.autograd.functional.jacobian(
+            image, (fixed[0], fixed[2]), vectorize=True
+        )
         g = torch.cat([by_mean, by_scale], -1).reshape(-1, len(s), 6).numpy()
         expected += np.einsum("pni,pnj->nij", g, g)
     found = fisher(s, VIEWS, probes=4000)
     size = np.sqrt(np.einsum("nii->ni", expected))
     np.testing.assert_allclose(
-        found / (size[:, :, None] * size[:, None]), expected / (size[:, :, None] * size[:, None]), atol=0.15
+        found / (size[:, :, None] * size[:, None]),
+        expected / (size[:, :, None] * size[:, None]),
+        atol=0.15,
     )
     assert (size > 0).all()
     np.testing.assert_allclose(_log_det(found), np.linalg.slogdet(expected)[1], atol=0.5)

@@ -24,8 +24,16 @@ def cloud(n: int = 3000) -> Splats:
 def test_figures_hang_together(tmp_path: Path) -> None:
     write_splats(tmp_path / "cloud.ply", cloud())
     isas, before = _core.instruction_sets(), _core.num_threads()
-    options = {"counts": "1000,9000", "image": "96,64", "threads": "1,2", "repeats": "2", "methods": "all"}
-    rows = measured("raster", SceneSpec("cloud", str(tmp_path / "cloud.ply")), tmp_path / "out", **options)
+    options = {
+        "counts": "1000,9000",
+        "image": "96,64",
+        "threads": "1,2",
+        "repeats": "2",
+        "methods": "all",
+    }
+    rows = measured(
+        "raster", SceneSpec("cloud", str(tmp_path / "cloud.ply")), tmp_path / "out", **options
+    )
     assert _core.num_threads() == before
     assert {row["error"] for row in rows if "error" in row} == {
         "the scene has 3,000 Gaussians, expected at least 9,000"
@@ -42,7 +50,10 @@ def test_figures_hang_together(tmp_path: Path) -> None:
 
 def test_a_gpu_is_measured_beside_the_cpu(tmp_path: Path) -> None:
     skip_without_gpu()
-    scene, options = ball_of(tmp_path, 600), {"ratios": "5", "repeats": "1", "steps": "3", "size": "24"}
+    scene, options = (
+        ball_of(tmp_path, 600),
+        {"ratios": "5", "repeats": "1", "steps": "3", "size": "24"},
+    )
     rows = measured("gpu", scene, tmp_path / "out", methods="cpu,gpu", **options)
     adapters = devices.adapters()
     assert adapters
@@ -54,7 +65,9 @@ def test_a_gpu_is_measured_beside_the_cpu(tmp_path: Path) -> None:
         assert all(row[name] > 0 for name in columns)
     assert abs(rows[0]["psnr"] - rows[1]["psnr"]) < 0.05
     if adapters[0].timestamps:
-        assert all(rows[1][f"{name}_ms"] > 0 for name in ("project", "sort", "draw", "backward", "update"))
+        assert all(
+            rows[1][f"{name}_ms"] > 0 for name in ("project", "sort", "draw", "backward", "update")
+        )
     assert "draw_ms" not in rows[0]
 
 

@@ -22,7 +22,9 @@ def ask(scene: SceneSpec, out: Path, name: str, **options: str) -> list[Row]:
     return rows
 
 
-def test_regularizer_rows_are_whole_and_not_measured_twice(scene: SceneSpec, tmp_path: Path) -> None:
+def test_regularizer_rows_are_whole_and_not_measured_twice(
+    scene: SceneSpec, tmp_path: Path
+) -> None:
     options = {"methods": "full,-anchor", "ratios": "5", "seeds": "0,1", "steps": "120"}
     found = ask(scene, tmp_path, "regularizers", **options)
     final = [row for row in found if row["final"]]

@@ -25,7 +25,16 @@ def _site(folder: Path) -> Cameras:
 
 def test_rows_hold_starts_and_results(tmp_path: Path, command_line: CommandLine) -> None:
     write_views(tmp_path / "views.json", _site(tmp_path))
-    call = ("benchmarks", "run", "register", "ball.ply", "--views", "views.json", "--methods", "direct")
+    call = (
+        "benchmarks",
+        "run",
+        "register",
+        "ball.ply",
+        "--views",
+        "views.json",
+        "--methods",
+        "direct",
+    )
     few = ("--size", "128", "--seeds", "0", "--set", "metres_per_unit=2", "--json", "-")
     ask = (*call, *few, "--ratios", "1,3", "--set", "starts=A,D")
     out = succeeds(command_line, tmp_path, *ask).out
@@ -69,15 +78,29 @@ def test_given_starts_and_the_protocol_of_gs_cpr(tmp_path: Path, command_line: C
 
 def test_recalls_count_every_photo() -> None:
     found = [PoseError(0.02, 1), PoseError(0.045, 1), PoseError(0.3, 1)]
-    assert figures(found, 4, 1) == {"10": 0.5, "5": 0.5, "position": 4.5, "rotation": 1, "worst": 30}
+    assert figures(found, 4, 1) == {
+        "10": 0.5,
+        "5": 0.5,
+        "position": 4.5,
+        "rotation": 1,
+        "worst": 30,
+    }
     assert figures(found, 4, 2)["5"] == 0.25
-    assert figures(found, 4, None) == {"10": None, "5": None, "position": 0.045, "rotation": 1, "worst": 0.3}
+    assert figures(found, 4, None) == {
+        "10": None,
+        "5": None,
+        "position": 0.045,
+        "rotation": 1,
+        "worst": 0.3,
+    }
     assert figures([], 4, 1) == {"10": 0, "5": 0, "position": None, "rotation": None, "worst": None}
 
 
 def test_views_of_cambridge_landmarks(tmp_path: Path, command_line: CommandLine) -> None:
     cambridge(tmp_path / "college")
-    said = succeeds(command_line, tmp_path, "benchmarks", "cambridge", "college", "-o", "college.json").err
+    said = succeeds(
+        command_line, tmp_path, "benchmarks", "cambridge", "college", "-o", "college.json"
+    ).err
     assert "1 views are not in reconstruction.nvm; they get the median focal length, 1674.0" in said
     found = read_view_set(tmp_path / "college.json")
     assert found.splits == ("train",) * 6 + ("test",) * 3

@@ -75,7 +75,10 @@ def test_the_study_scores_training_like_recovery(tmp_path: Path) -> None:
     rows = measured("retrain", ball_of(tmp_path, 400), tmp_path / "run", **options)
     assert [row.get("error") for row in rows if row["variant"] == "g2ard"][-1] is None
     trained = [row for row in rows if row["variant"] == "mcmc@30"]
-    assert [(row["step"], row["count"], row["final"]) for row in trained] == [(25, 40, 0), (30, 40, 1)]
+    assert [(row["step"], row["count"], row["final"]) for row in trained] == [
+        (25, 40, 0),
+        (30, 40, 1),
+    ]
     assert 0 < trained[0]["seconds"] <= trained[1]["seconds"]
 
 
@@ -103,11 +106,16 @@ def test_the_scene_returns_where_it_was() -> None:
 def test_projection_draws_the_faint_to_zero_and_leaves_the_others() -> None:
     """After two projections of the same opacities, z − λ is −2α for the faint half and α for the other."""
     logits = np.where(np.arange(400) < 200, -2, 0.5).astype(np.float32)
-    training, strategy = Training(replace(BALL, logit_opacities=logits), TARGETS, 1), GaussianSpa(200, 1000)
+    training, strategy = (
+        Training(replace(BALL, logit_opacities=logits), TARGETS, 1),
+        GaussianSpa(200, 1000),
+    )
     first = strategy.penalty(training)
     strategy._project(training)
     alpha = 1 / (1 + np.exp(-logits))
-    np.testing.assert_allclose(strategy._goal.numpy(), np.where(logits < 0, -2 * alpha, alpha), rtol=1e-5)
+    np.testing.assert_allclose(
+        strategy._goal.numpy(), np.where(logits < 0, -2 * alpha, alpha), rtol=1e-5
+    )
     second = strategy.penalty(training)
     assert second.item() == pytest.approx(9 / 4 * first.item(), rel=1e-5)
     second.backward()
@@ -174,8 +182,14 @@ def test_relocated_copies_take_the_light_of_one(copies: int, opacity: float) -> 
 
 
 def test_dead_gaussians_move_onto_living_ones() -> None:
-    start = {"opacities": torch.tensor([-9.0, 2.0, -9.0]), "scales": torch.zeros(3, 3), "means": torch.eye(3)}
-    values = torch.nn.ParameterDict({name: torch.nn.Parameter(value) for name, value in start.items()})
+    start = {
+        "opacities": torch.tensor([-9.0, 2.0, -9.0]),
+        "scales": torch.zeros(3, 3),
+        "means": torch.eye(3),
+    }
+    values = torch.nn.ParameterDict(
+        {name: torch.nn.Parameter(value) for name, value in start.items()}
+    )
     optimizers = {name: torch.optim.Adam([value]) for name, value in values.items()}
     sum(value.sum() for value in values.values()).backward()
     for optimizer in optimizers.values():
@@ -197,8 +211,12 @@ class Fixed(TeacherRenders):
         return TARGETS[view]
 
 
-@pytest.mark.parametrize(("scale", "shift"), [(8.0, (40.0, -24.0, 16.0)), (1 / 64, (0.0, 1.0, 0.0))])
-def test_it_is_the_same_at_any_place_and_scale(scale: float, shift: tuple[float, float, float]) -> None:
+@pytest.mark.parametrize(
+    ("scale", "shift"), [(8.0, (40.0, -24.0, 16.0)), (1 / 64, (0.0, 1.0, 0.0))]
+)
+def test_it_is_the_same_at_any_place_and_scale(
+    scale: float, shift: tuple[float, float, float]
+) -> None:
     """Rates, noise and weights of MCMC are for cameras within a unit sphere."""
     world = np.diag([scale, scale, scale, 1.0])
     world[:3, 3] = shift

@@ -58,7 +58,8 @@ def test_every_arm_runs_once_and_never_again(scene: SceneSpec, tmp_path: Path) -
     lines = (tmp_path / "rows.csv").read_text().splitlines(keepends=True)
     assert run([made], tmp_path) == trials
     assert (tmp_path / "rows.csv").read_text() == "".join(lines)
-    (tmp_path / "rows.csv").write_text("".join(lines[:1] + lines[4:]))  # as if stopped, three trials short
+    # as if stopped, three trials short
+    (tmp_path / "rows.csv").write_text("".join(lines[:1] + lines[4:]))
     again = run([made], tmp_path)
     for name in ("arm", "psnr_in", "ssim_out"):
         assert [t[name] for t in again] == [t[name] for t in trials]

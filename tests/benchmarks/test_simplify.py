@@ -20,17 +20,26 @@ METHODS = ("default", "fast", "paper", "nanogs", "lightgaussian")
 
 
 def ask(scene: SceneSpec, out: Path, methods: str, protocol: str = "pool") -> list[Row]:
-    return measured("simplify", scene, out, ratios="4", methods=methods, protocol=protocol, size="64")
+    return measured(
+        "simplify", scene, out, ratios="4", methods=methods, protocol=protocol, size="64"
+    )
 
 
 @needs_processes
-def test_measures_writes_and_resumes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, programs: None) -> None:
+def test_measures_writes_and_resumes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, programs: None
+) -> None:
     scene = ball_of(tmp_path, 2000)
     rows = ask(scene, tmp_path / "out", ",".join(METHODS))
     assert [row["method"] for row in rows] == list(METHODS)
     for row in rows:
         assert "error" not in row
-        assert (row["input_count"], row["budget"], row["count"], row["views"]) == (2000, 500, 500, 2)
+        assert (row["input_count"], row["budget"], row["count"], row["views"]) == (
+            2000,
+            500,
+            500,
+            2,
+        )
         assert 8 < row["psnr"] < 60
         assert 0 < row["cpu_s"] < 60
         assert 20 < row["peak_mb"] < 2000
@@ -118,7 +127,9 @@ def test_made_standing_views_are_of_another_kind(make) -> None:
     assert standing.Ks[0, 0, 0] == pytest.approx(standing.widths[0] / 2 / np.tan(np.radians(35)))
     if make is naive.statue:
         middle = np.array([0, 0, 0.5])
-        away = [np.linalg.norm(c.positions - middle, axis=1).mean() for c in (*found.values(), pool)]
+        away = [
+            np.linalg.norm(c.positions - middle, axis=1).mean() for c in (*found.values(), pool)
+        ]
         assert away[0] < away[2]
         assert away[1] < 0.8 * away[2]
     if make is naive.room:
@@ -133,7 +144,8 @@ def test_views_from_anywhere_are_near_free_and_repeatable() -> None:
     splats = naive.statue()
     views = anywhere_views(splats, 6)
     assert len(views) == 6
-    assert not (np.linalg.norm(views.positions - (0, 0, 1.3), axis=1) < 1.0).any()  # within its hollow body
+    # within its hollow body
+    assert not (np.linalg.norm(views.positions - (0, 0, 1.3), axis=1) < 1.0).any()
     gaps = np.linalg.norm(splats.means[:, None] - views.positions, axis=2).min(axis=0)
     diagonal = np.linalg.norm(np.ptp(splats.means, axis=0))
     assert (gaps < 0.4 * diagonal).all()
@@ -144,7 +156,12 @@ def test_views_from_anywhere_are_near_free_and_repeatable() -> None:
 @needs_processes
 def test_fixed_growths_are_compared_in_views_of_other_kinds(tmp_path: Path) -> None:
     scene = ball_of(tmp_path, 1200, views=False)
-    rows = measured("growth", scene, tmp_path / "out", ratios="10", methods="growth-1.25,growth-4", size="64")
+    rows = measured(
+        "growth", scene, tmp_path / "out", ratios="10", methods="growth-1.25,growth-4", size="64"
+    )
     first, last = (rows[i : i + 3] for i in (0, 3))
     assert [row["views_kind"] for row in first] == ["near", "standing", "anywhere"]
-    assert all(a["count"] == b["count"] and a["psnr"] != b["psnr"] for a, b in zip(first, last, strict=True))
+    assert all(
+        a["count"] == b["count"] and a["psnr"] != b["psnr"]
+        for a, b in zip(first, last, strict=True)
+    )

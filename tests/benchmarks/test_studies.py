@@ -128,9 +128,15 @@ def test_the_report_shows_rows_seeds_and_failures(tmp_path: Path) -> None:
             "method rounds: period: expected a whole number of at least 1",
         ),
         (("protection = 0.0", 'rounds = "many"'), "rounds: expected one of one, paper, pup"),
-        (("protection = 0.0", "shared_start = 3"), "method rounds: shared_start: expected true or false"),
+        (
+            ("protection = 0.0", "shared_start = 3"),
+            "method rounds: shared_start: expected true or false",
+        ),
         (('name = "ball"', 'nam = "ball"'), "lacks 'name'"),
-        (('name = "ball"', 'name = "ball"\nadapt_last = -1'), "scene ball: adapt_last: expected a whole"),
+        (
+            ('name = "ball"', 'name = "ball"\nadapt_last = -1'),
+            "scene ball: adapt_last: expected a whole",
+        ),
         (('name = "ball"', 'name = "b"\nadapt_last = 2\nadapt = "a"'), "without `adapt`"),
         (("ratios = [4]", "ratios = [4"), "balls.toml"),
         (("ratios = [4]", "ratios = []"), "no ratios"),
@@ -148,13 +154,17 @@ def test_the_report_shows_rows_seeds_and_failures(tmp_path: Path) -> None:
         (('title = "Balls"', 'kind = "cake"'), "kind: expected one of matched"),
     ],
 )
-def test_invalid_studies_name_the_cause(tmp_path: Path, change: tuple[str, str], message: str) -> None:
+def test_invalid_studies_name_the_cause(
+    tmp_path: Path, change: tuple[str, str], message: str
+) -> None:
     with pytest.raises(InputError, match=re.escape(message)) as caught:
         read_study(study(tmp_path, STUDY.replace(*change)))
     assert "balls.toml" in str(caught.value)
 
 
-def test_all_studies_can_be_read_and_name_their_differences(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_all_studies_can_be_read_and_name_their_differences(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     paths = sorted(DEFINITIONS.rglob("*.toml"))
     for path in paths:
         for name in re.findall(r"\$(\w+)", path.read_text()):
@@ -162,7 +172,15 @@ def test_all_studies_can_be_read_and_name_their_differences(monkeypatch: pytest.
     found = {path.stem: read_study(path) for path in paths}
     assert "$" not in repr([asdict(scene) for made in found.values() for scene in made.scenes])
     assert [m.name for m in found["ablations"].methods][:3] == ["full", "one-shot", "-shape"]
-    for name in ("ablations", "k_sweep", "policies", "protection", "compression", "geobase", "source"):
+    for name in (
+        "ablations",
+        "k_sweep",
+        "policies",
+        "protection",
+        "compression",
+        "geobase",
+        "source",
+    ):
         assert found[name].differs
         assert any(method.lambdas == "paper" for method in found[name].methods), name
     assert all(method.shared_start for method in found["policies"].methods)
@@ -179,19 +197,32 @@ def test_all_studies_can_be_read_and_name_their_differences(monkeypatch: pytest.
 
 def test_options_narrow_a_study(tmp_path: Path) -> None:
     made = read_study(study(tmp_path, STUDY.replace("ratios", 'differs = ["small"]\nratios')))
-    small = made.narrowed({"ratios": "5,10", "methods": "rounds,random", "scene.background": "0,1,0.5"})
+    small = made.narrowed(
+        {"ratios": "5,10", "methods": "rounds,random", "scene.background": "0,1,0.5"}
+    )
     assert small.ratios == (5.0, 10.0)
     assert [method.name for method in small.methods] == ["rounds", "random"]
     assert small.methods[0] == made.methods[2]  # the study's own
     assert small.scenes[0].background == (0.0, 1.0, 0.5)
     assert small.differs[0].startswith("run with ratios 5,10, methods rounds,random")
-    for name, message in (("rations", "no key"), ("x.y", "no key"), ("ratios", "expected a number")):
+    for name, message in (
+        ("rations", "no key"),
+        ("x.y", "no key"),
+        ("ratios", "expected a number"),
+    ):
         with pytest.raises(InputError, match=message):
             made.narrowed({name: "x"})
 
 
 def test_recorded_rows_are_read(tmp_path: Path) -> None:
-    names = ("run-*.csv", "simplify-*.csv", "recover-*.csv", "select-2*.csv", "ship-*.csv", "register-*.csv")
+    names = (
+        "run-*.csv",
+        "simplify-*.csv",
+        "recover-*.csv",
+        "select-2*.csv",
+        "ship-*.csv",
+        "register-*.csv",
+    )
     for name in names:
         paths = sorted((ROOT / "benchmarks" / "record").rglob(name))
         assert paths
@@ -222,7 +253,10 @@ def test_command(command_line: CommandLine, tmp_path: Path, programs: None) -> N
         (("nothing",), "no study 'nothing'"),
         (("balls.toml", "--views", "views.json"), "go with scenes"),
         (("balls.toml", "--set", "ratios"), "expected KEY=VALUE"),
-        (("simplify", "ball.ply", "--set", "protocol=sitting"), "protocol: expected one of all, pool"),
+        (
+            ("simplify", "ball.ply", "--set", "protocol=sitting"),
+            "protocol: expected one of all, pool",
+        ),
     ):
         status, _, err = command_line("benchmarks", "run", *wrong, "-o", "x", cwd=tmp_path)
         assert status in (1, 2)
@@ -230,7 +264,9 @@ def test_command(command_line: CommandLine, tmp_path: Path, programs: None) -> N
     assert not (tmp_path / "x").exists()
 
 
-def test_an_unset_variable_is_named_before_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_unset_variable_is_named_before_work(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.delenv("G2ARD_NOWHERE", raising=False)
     text = STUDY.replace("ball.ply", "${G2ARD_NOWHERE}/ball.ply")
     with pytest.raises(InputError, match=r"scene ball: \$G2ARD_NOWHERE is not set"):

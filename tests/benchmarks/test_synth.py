@@ -52,7 +52,9 @@ def test_first_hits_are_the_naive_casters(packet):
     directions = rng.standard_normal((4000, 3))
     directions[:300, rng.integers(3)] = 0.0  # parallel to faces
     want, body = naive.first_hits(shapes, origins, directions)
-    t, hit = cast(shapes, np.ascontiguousarray(origins.T), np.ascontiguousarray(directions.T), packet=packet)
+    t, hit = cast(
+        shapes, np.ascontiguousarray(origins.T), np.ascontiguousarray(directions.T), packet=packet
+    )
     assert (hit >= 0).mean() > 0.2
     np.testing.assert_array_equal(hit, body)
     np.testing.assert_allclose(t, want, rtol=1e-9, atol=1e-9)
@@ -67,17 +69,22 @@ def test_points_lie_on_surfaces_within_noise(town, scan):
             Kind(shapes.kinds[p]), shapes.lo[p], shapes.hi[p], scan.positions[at]
         )
     assert away.max() < 6 * noise
-    assert 0.2 * noise < away.mean() < 0.8 * noise  # a half-normal's mean is 0.8 σ, less where beams graze
+    # a half-normal's mean is 0.8 σ, less where beams graze
+    assert 0.2 * noise < away.mean() < 0.8 * noise
     exact = City(replace(SMALL, noise=0.0)).points(1000)
     for p in np.unique(exact.primitives):
         at = exact.positions[exact.primitives == p]
-        assert naive.surface_distance(Kind(shapes.kinds[p]), shapes.lo[p], shapes.hi[p], at).max() < 1e-8
+        assert (
+            naive.surface_distance(Kind(shapes.kinds[p]), shapes.lo[p], shapes.hi[p], at).max()
+            < 1e-8
+        )
 
 
 def test_scan_is_exact_in_count_and_denser_near_scanners(large, large_scan):
     assert len(large_scan.positions) == LARGE.points
     materials = large.layout.materials[large_scan.primitives]
-    assert set(Material) <= set(materials.tolist())  # ground, blocks, facades, roofs, leaves, the rest
+    # ground, blocks, facades, roofs, leaves, the rest
+    assert set(Material) <= set(materials.tolist())
     ground = large_scan.positions[materials == Material.GROUND]
     beyond = (np.abs(ground[:, :2]) - large.layout.reach).max(1)
     street, edge = (beyond < 5).sum(), (beyond > 25).sum()
@@ -99,7 +106,9 @@ def test_cloud_and_photos_agree_in_colour(large, large_scan):
         rays = np.linalg.solve(view.Ks[0], [column + 0.5, row + 0.5, np.ones(len(at))])
         depth, _ = cast(large.layout.shapes, view.positions.T, view.viewmats[0, :3, :3].T @ rays)
         visible = np.abs(depth - camera[at, 2]) < 0.02 * camera[at, 2]
-        difference.append(np.abs(large.photo(view, 0)[row, column] - large_scan.colors[at])[visible].mean(1))
+        difference.append(
+            np.abs(large.photo(view, 0)[row, column] - large_scan.colors[at])[visible].mean(1)
+        )
     away = np.concatenate(difference)
     assert len(away) > 400
     assert np.median(away) < 0.035  # leaves, bricks and edges differ within a pixel
@@ -119,7 +128,8 @@ def test_splits_are_disjoint(town):
     for own in ("adapt", "ood"):
         for other in ({"train", "val", "adapt", "ood"}) - {own}:
             assert nearest(own, other) > 0.5
-    many = city(replace(LARGE, views=100)).views  # val lies on the train trajectories: between its neighbours
+    # val lies on the train trajectories: between its neighbours
+    many = city(replace(LARGE, views=100)).views
     gaps = np.linalg.norm(many["val"].positions[:, None] - many["train"].positions, axis=2).min(1)
     assert np.median(gaps) < 20
 
@@ -135,7 +145,9 @@ def test_cameras_have_room_and_something_to_see(blocks, seed):
             assert t.min() > 0.3, cameras.names[i]
             found = hit >= 0
             normals = town.layout.shapes.normals(at + rays[:, found] * t[found], hit[found])
-            assert (normals * rays[:, found]).sum(0).max() < 1e-9, f"{cameras.names[i]} is within matter"
+            assert (normals * rays[:, found]).sum(0).max() < 1e-9, (
+                f"{cameras.names[i]} is within matter"
+            )
             seen = (town.photo(cameras, i) != np.float32(town.config.sky)).any(2)
             assert seen.mean() > 0.2, f"{cameras.names[i]} sees nothing"
 
@@ -171,7 +183,14 @@ def test_interrupted_leaves_nothing(tmp_path):
 
 def test_invalid_cities_are_rejected():
     for name, value in (
-        *(("views", 7), ("points", 0), ("blocks", 0), ("size", (0, 5)), ("noise", np.nan), ("seed", -1)),
+        *(
+            ("views", 7),
+            ("points", 0),
+            ("blocks", 0),
+            ("size", (0, 5)),
+            ("noise", np.nan),
+            ("seed", -1),
+        ),
         *(("sky", (2.0, 0, 0)), ("offset", (np.inf, 0, 0))),
     ):
         with pytest.raises(InputError, match=name.replace("size", "width")):
@@ -184,7 +203,8 @@ def test_a_ring_scan_lies_on_a_room_and_its_furniture(tmp_path, command_line):
     cloud = read_points(tmp_path / "rings.ply")
     room = np.array([10.0, 7.0, 3.0])
     off = [np.minimum(np.abs(cloud.positions), np.abs(cloud.positions - room)).min(axis=1)]
-    for lo, hi in rings._FURNITURE:  # the largest of six signed distances of a box is that of its surface
+    # the largest of six signed distances of a box is that of its surface
+    for lo, hi in rings._FURNITURE:
         far = np.maximum(np.array(lo) - cloud.positions, cloud.positions - np.array(hi)).max(axis=1)
         off.append(np.abs(far))
     assert np.min(off, axis=0).max() < 0.06  # six times the noise

@@ -18,13 +18,17 @@ def test_any_character_set(tmp_path: Path, words: str, encoding: str) -> None:
     env = os.environ | {"PYTHONIOENCODING": encoding}
     done = subprocess.run(command, env=env, cwd=tmp_path, capture_output=True, check=False)
     said = (done.stdout + done.stderr).decode(encoding)
-    assert done.returncode == (0 if "a.ply" in words or "help" in words else 2 if words == "ż→" else 1)
+    assert done.returncode == (
+        0 if "a.ply" in words or "help" in words else 2 if words == "ż→" else 1
+    )
     assert "internal error" not in said
     assert "?" in said if "→" in words else said
 
 
 @pytest.mark.skipif(os.name == "nt" or sys.platform == "darwin", reason="names are Unicode there")
-@pytest.mark.parametrize("command", ["convert {} {}.sog", "simplify {} -n 9 -o {}.ply", "view {} -o {}.html"])
+@pytest.mark.parametrize(
+    "command", ["convert {} {}.sog", "simplify {} -n 9 -o {}.ply", "view {} -o {}.html"]
+)
 def test_names_that_are_not_utf8(tmp_path: Path, command: str) -> None:
     name = os.fsdecode(b"M\xe4ller")
     save(tmp_path / f"{name}-in.ply", columns(scene()))
@@ -42,5 +46,7 @@ def test_progress_without_a_console(tmp_path: Path, stream: str) -> None:
         f"import sys, g2ard; sys.stderr = {stream}\n"
         "print(len(g2ard.simplify('a.ply', count=9, progress=g2ard.show_progress).splats))"
     )
-    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, check=False)
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, check=False
+    )
     assert done.stdout.split() == [b"9"]

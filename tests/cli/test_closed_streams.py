@@ -24,7 +24,11 @@ def run_apart(folder: Path, words: str, closed: str) -> tuple[int, str]:
     """Return the exit status of a new program, and all that the open streams get."""
     line = f'exec "$0" -m g2ard {words} {closed}'
     done = subprocess.run(
-        ["sh", "-c", line, sys.executable], cwd=folder, env=environment(), capture_output=True, text=True
+        ["sh", "-c", line, sys.executable],
+        cwd=folder,
+        env=environment(),
+        capture_output=True,
+        text=True,
     )
     return done.returncode, done.stdout + done.stderr
 

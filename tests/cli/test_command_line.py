@@ -23,9 +23,15 @@ def imported_by(statement: str, *heavy: str) -> list[str]:
 
 
 def test_import_and_help_load_nothing_heavy() -> None:
-    assert imported_by("import g2ard", "torch", "numpy", "PIL", "typer", "rich", "g2ard._core") == []
-    show_help = "import contextlib, io\nfrom g2ard.cli.main import main\nsys.argv = ['g2ard', {words}]\n"
-    show_help += "with contextlib.redirect_stdout(io.StringIO()), contextlib.suppress(SystemExit): main()\n"
+    assert (
+        imported_by("import g2ard", "torch", "numpy", "PIL", "typer", "rich", "g2ard._core") == []
+    )
+    show_help = (
+        "import contextlib, io\nfrom g2ard.cli.main import main\nsys.argv = ['g2ard', {words}]\n"
+    )
+    show_help += (
+        "with contextlib.redirect_stdout(io.StringIO()), contextlib.suppress(SystemExit): main()\n"
+    )
     heavy = "torch", "numpy", "PIL"
     assert imported_by(show_help.format(words="'--help'"), *heavy, "g2ard.cli.commands.") == []
     for command in COMMANDS:
@@ -46,7 +52,9 @@ def test_config_files_are_utf_8(tmp_path: Path, mark: bytes) -> None:
     assert eval(done.stdout) == {"output": "größe/×.ply"}
 
 
-def test_progress_lines(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_progress_lines(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     now = 0.0
     monkeypatch.setattr("g2ard.cli.console.time.monotonic", lambda: now)
     console = Console()
@@ -98,7 +106,12 @@ def test_a_machine_without_a_gpu_says_one_thing(tmp_path: Path) -> None:
         without = dict.fromkeys(("VK_ICD_FILENAMES", "VK_DRIVER_FILES"), "/dev/null")
         ask = [sys.executable, "-m", "g2ard", *map(str, words)]
         done = subprocess.run(
-            ask, cwd=tmp_path, env={**os.environ, **without}, capture_output=True, text=True, check=True
+            ask,
+            cwd=tmp_path,
+            env={**os.environ, **without},
+            capture_output=True,
+            text=True,
+            check=True,
         )
         return done.stdout + done.stderr
 
@@ -107,7 +120,16 @@ def test_a_machine_without_a_gpu_says_one_thing(tmp_path: Path) -> None:
     if not reasons:
         pytest.skip("a driver that needs no list of drivers")
     assert re.search(r"--device auto +│ the CPU", listed)
-    ask = ("evaluate", "ball.ply", "--teacher", "ball.ply", "--views", "views.json", "--split", "all")
+    ask = (
+        "evaluate",
+        "ball.ply",
+        "--teacher",
+        "ball.ply",
+        "--views",
+        "views.json",
+        "--split",
+        "all",
+    )
     assert reasons[0] in told(*ask, "--device", "gpu")
     assert "GPU" not in told(*ask, "--device", "auto")
 
@@ -118,7 +140,9 @@ def test_a_page_that_is_served_leaves_no_live_line(
     g2ard.save(tmp_path / "ball.ply", checkered_ball(300))
     done: list[str] = []
     close = Console.close
-    monkeypatch.setattr(Console, "close", lambda console: [done.append("closed"), close(console)][1])
+    monkeypatch.setattr(
+        Console, "close", lambda console: [done.append("closed"), close(console)][1]
+    )
 
     monkeypatch.setattr(Run, "answer", lambda run, text: done.append(text))
     assert "stopped" in succeeds(command_line, tmp_path, "view", "ball.ply").err
@@ -164,7 +188,9 @@ def test_an_interrupt_while_a_class_is_made_is_one(
         def __set_name__(self, owner: type, name: str) -> None:
             raise KeyboardInterrupt
 
-    monkeypatch.setattr("g2ard.jobs.clean.clean", lambda *_, **__: type("Made", (), {"field": Stopped()}))
+    monkeypatch.setattr(
+        "g2ard.jobs.clean.clean", lambda *_, **__: type("Made", (), {"field": Stopped()})
+    )
     error = refused(command_line, folder, "clean", "ball.ply", "-o", "clean.ply", status=130)
     assert error == "g2ard: interrupted; nothing was written\n"
 

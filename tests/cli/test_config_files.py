@@ -23,7 +23,10 @@ from helpers.commands import CommandLine, refused, succeeds
         ("[simplify]\nratio = 4\n[distill]\nhold_out = 3", "held-out"),
         ("[simplify]\nn = 9", "`simplify` has no option n (write count)"),
         ("n = 9", "has no option n (write count)"),
-        ("[simplify]\nmin-psnr = true", "'--min-psnr': expected a number of at least 1, got 'true'"),
+        (
+            "[simplify]\nmin-psnr = true",
+            "'--min-psnr': expected a number of at least 1, got 'true'",
+        ),
         ("[simplify\n", "c.toml: "),
         ('[simplify]\nratio = 4\noutput = "C:\\Users\\me\\s.ply"', "write paths in single quotes"),
         ('[simplify]\nratio = 4\noutput = "D:\\scans\\s.ply"', "write paths in single quotes"),
@@ -40,7 +43,9 @@ def test_wrong_names_and_values_are_named(
 
 @pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "utf-16-le"])
 @pytest.mark.parametrize("end", ["\n", "\r\n"])
-def test_config_files_of_windows(command_line: CommandLine, folder: Path, encoding: str, end: str) -> None:
+def test_config_files_of_windows(
+    command_line: CommandLine, folder: Path, encoding: str, end: str
+) -> None:
     text = end.join(["[simplify]", "ratio = [10]", "output = 's.ply'", ""])
     mark = "\ufeff" if encoding == "utf-16-le" else ""
     (folder / "c.toml").write_bytes((mark + text).encode(encoding))
@@ -49,7 +54,9 @@ def test_config_files_of_windows(command_line: CommandLine, folder: Path, encodi
 
 
 def test_keys_above_tables_apply_to_every_command(command_line: CommandLine, folder: Path) -> None:
-    (folder / "c.toml").write_text("seed = 5\nsize = 64\n[simplify]\nratio = [10]\n[render]\nsplit = 'test'")
+    (folder / "c.toml").write_text(
+        "seed = 5\nsize = 64\n[simplify]\nratio = [10]\n[render]\nsplit = 'test'"
+    )
     ask = ("simplify", "ball.ply", "-o", "s.ply", "--config", "c.toml", "--json", "-")
     found = json.loads(succeeds(command_line, folder, *ask).out)
     assert (found["output_count"], found["config"]["seed"]) == (40, 5)
@@ -90,11 +97,15 @@ def test_printed_configs(
     assert command_line(*ask, cwd=folder) == (0, out, "")
 
 
-def test_settings_are_checked_without_running_the_command(command_line: CommandLine, folder: Path) -> None:
+def test_settings_are_checked_without_running_the_command(
+    command_line: CommandLine, folder: Path
+) -> None:
     """`recover` says which background it takes from a run."""
     (folder / "run").mkdir()
     (folder / "ball.ply").rename(folder / "run" / "scene.ply")
     (folder / "run" / "report.json").write_text('{"settings": {"recover.background": [1, 1, 1]}}')
     ask = ("recover", "run", "--views", "views.json", "-o", "out.ply", "--print-config")
     assert succeeds(command_line, folder, *ask, "--set", "steps=3").err == ""
-    assert "--set: recover.steps: expected" in refused(command_line, folder, *ask, "--set", "steps=-3")
+    assert "--set: recover.steps: expected" in refused(
+        command_line, folder, *ask, "--set", "steps=-3"
+    )

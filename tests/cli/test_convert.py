@@ -20,7 +20,9 @@ def test_convert_merges_crops_moves(tmp_path: Path, command_line: CommandLine) -
     a, b = directional(1), transform(directional(3), matrix(1, np.eye(3), [5, 0, 0]))
     write_splats(tmp_path / "a.ply", a)
     write_splats(tmp_path / "b.glb", b)
-    (tmp_path / "m.json").write_text(json.dumps({"transform": matrix(1, turn(), [0, 0, 1]).tolist()}))
+    (tmp_path / "m.json").write_text(
+        json.dumps({"transform": matrix(1, turn(), [0, 0, 1]).tolist()})
+    )
     out = tmp_path / "c.ply"
     words = ["a.ply", "b.glb", "c.ply", "--box", "-9,-9,0,9,9,9", "--transform", "m.json"]
     succeeds(command_line, tmp_path, "convert", *words)
@@ -38,8 +40,14 @@ def test_convert_writes_a_version_and_a_degree(tmp_path: Path, command_line: Com
     assert read_splats(tmp_path / "b.spz").sh_degree == 1
 
 
-def test_convert_takes_its_output_with_or_without_o(command_line: CommandLine, folder: Path) -> None:
-    written = [("ball.ply", "-o", "a.splat"), ("-o", "b.splat", "ball.ply"), ("ball.ply", "c.splat")]
+def test_convert_takes_its_output_with_or_without_o(
+    command_line: CommandLine, folder: Path
+) -> None:
+    written = [
+        ("ball.ply", "-o", "a.splat"),
+        ("-o", "b.splat", "ball.ply"),
+        ("ball.ply", "c.splat"),
+    ]
     for arguments in written:
         out = succeeds(command_line, folder, "convert", *arguments, "--json", "-").out
         config = json.loads(out)["config"]
@@ -65,7 +73,9 @@ def test_convert_keeps_what_fulfils_a_condition(tmp_path: Path, command_line: Co
     largest = scene.scales.max(1)
     conditions = {
         "opacity > 0.05 and largest_scale < 2": (scene.opacities > 0.05) & (largest < 2),
-        "not (red >= .5 or blue >= .5)": ~((scene.colors[:, 0] >= 0.5) | (scene.colors[:, 2] >= 0.5)),
+        "not (red >= .5 or blue >= .5)": ~(
+            (scene.colors[:, 0] >= 0.5) | (scene.colors[:, 2] >= 0.5)
+        ),
         "999 < x <= 1001": (scene.means[:, 0] > -1) & (scene.means[:, 0] <= 1),
         "sqrt(y*y + z*z) < 3": np.hypot(scene.means[:, 1], scene.means[:, 2]) < 3,
         "largest_scale / max(smallest_scale, 1e-6) > 4 - -1": largest / scene.scales.min(1) > 5,
@@ -113,8 +123,12 @@ def test_convert_rejects_what_is_no_condition(
     assert message in line
 
 
-def test_convert_keeps_the_outside_of_a_box_or_sphere(tmp_path: Path, command_line: CommandLine) -> None:
-    scene = Splats.create(np.random.default_rng(0).uniform(-5, 5, (200, 3)), scales=np.ones((200, 3)))
+def test_convert_keeps_the_outside_of_a_box_or_sphere(
+    tmp_path: Path, command_line: CommandLine
+) -> None:
+    scene = Splats.create(
+        np.random.default_rng(0).uniform(-5, 5, (200, 3)), scales=np.ones((200, 3))
+    )
     write_splats(tmp_path / "a.ply", scene)
     scene = read_splats(tmp_path / "a.ply")
     inside = in_box(scene, [-3, -3, -3], [3, 3, 3])
@@ -143,7 +157,9 @@ def test_convert_writes_a_table(tmp_path: Path, command_line: CommandLine) -> No
 
     np.testing.assert_array_equal(table("x", "y", "z"), scene.means.astype(float) + scene.offset)
     read = read_splats(tmp_path / "a.ply")
-    np.testing.assert_array_equal(table("scale_x", "scale_y", "scale_z").astype(np.float32), read.scales)
+    np.testing.assert_array_equal(
+        table("scale_x", "scale_y", "scale_z").astype(np.float32), read.scales
+    )
     np.testing.assert_array_equal(table("opacity")[:, 0].astype(np.float32), read.opacities)
     np.testing.assert_array_equal(table("green_2")[:, 0].astype(np.float32), read.shN[:, 1, 1])
     assert ".csv has no option" in refused(
@@ -152,7 +168,9 @@ def test_convert_writes_a_table(tmp_path: Path, command_line: CommandLine) -> No
     assert "exists" in refused(command_line, tmp_path, "convert", "a.ply", "b.csv", status=1)
 
 
-def test_convert_writes_the_layout_of_inrias_trainer(tmp_path: Path, command_line: CommandLine) -> None:
+def test_convert_writes_the_layout_of_inrias_trainer(
+    tmp_path: Path, command_line: CommandLine
+) -> None:
     write_splats(tmp_path / "a.ply", directional(1))
     succeeds(command_line, tmp_path, "convert", "a.ply", "b.ply", "--layout", "inria")
     header, _, body = (tmp_path / "b.ply").read_bytes().partition(b"end_header\n")
@@ -169,15 +187,21 @@ def test_convert_writes_the_layout_of_inrias_trainer(tmp_path: Path, command_lin
     np.testing.assert_array_equal(rows[:, 9:12], directional(1).shN[:, :, 0])
     assert not rows[:, 12:24].any()
     np.testing.assert_array_equal(read_splats(tmp_path / "b.ply").shN[:, :3], directional(1).shN)
-    for words in (("b.sog", "--layout", "inria"), ("c.ply", "--layout", "inria", "--sh-degree", "0")):
+    for words in (
+        ("b.sog", "--layout", "inria"),
+        ("c.ply", "--layout", "inria", "--sh-degree", "0"),
+    ):
         assert command_line("convert", "a.ply", *words, cwd=tmp_path)[0] != 0
 
 
-def test_convert_scales_then_rotates_then_translates(tmp_path: Path, command_line: CommandLine) -> None:
+def test_convert_scales_then_rotates_then_translates(
+    tmp_path: Path, command_line: CommandLine
+) -> None:
     scene = directional()
     write_splats(tmp_path / "a.ply", scene)
     words = ("--scale", "2", "--rotate", "90,0,90", "--translate", "1,2,3")
     succeeds(command_line, tmp_path, "convert", "a.ply", "b.ply", *words)
     x, y, z = 2 * scene.means.astype(float).T
-    expected = np.stack([z + 1, x + 2, y + 3], 1)  # about x: y → z, z → −y; then about z: x → y, y → −x
+    # about x: y → z, z → −y; then about z: x → y, y → −x
+    expected = np.stack([z + 1, x + 2, y + 3], 1)
     np.testing.assert_allclose(read_splats(tmp_path / "b.ply").means, expected, atol=1e-5)

@@ -28,9 +28,13 @@ SHOWING = {
 
 
 @pytest.mark.filterwarnings("error::RuntimeWarning")
-@pytest.mark.parametrize("name", ["1", "3", "50 in one place", "one visible", "on an axis", "on a plane"])
+@pytest.mark.parametrize(
+    "name", ["1", "3", "50 in one place", "one visible", "on an axis", "on a plane"]
+)
 @pytest.mark.parametrize("call", SHOWING)
-def test_a_degenerate_scene_is_shown(call: str, name: str, tmp_path: Path, command_line: CommandLine) -> None:
+def test_a_degenerate_scene_is_shown(
+    call: str, name: str, tmp_path: Path, command_line: CommandLine
+) -> None:
     g2ard.save(tmp_path / "scene.ply", SCENES[name])
     succeeds(command_line, tmp_path, *SHOWING[call].split())
 
@@ -66,7 +70,11 @@ def _files(folder: Path) -> dict[str, bytes]:
 
 @pytest.mark.parametrize("call", PICTURES)
 def test_a_page_that_fails_costs_nothing_else(
-    call: str, inputs: Path, tmp_path: Path, command_line: CommandLine, monkeypatch: pytest.MonkeyPatch
+    call: str,
+    inputs: Path,
+    tmp_path: Path,
+    command_line: CommandLine,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     words = [*SHOWING[call].split(), "--json", "told.json"]
 

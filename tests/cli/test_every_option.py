@@ -14,8 +14,12 @@ from helpers.commands import CommandLine, succeeds
 
 NO_RESULT = {
     **dict.fromkeys(("quiet", "verbose", "json"), "say more or less"),
-    **dict.fromkeys(("overwrite", "resume", "work", "dry_run", "print_config"), "say whether to compute"),
-    **dict.fromkeys(("threads", "device", "workers", "scheduler", "memory"), "say where to compute"),
+    **dict.fromkeys(
+        ("overwrite", "resume", "work", "dry_run", "print_config"), "say whether to compute"
+    ),
+    **dict.fromkeys(
+        ("threads", "device", "workers", "scheduler", "memory"), "say where to compute"
+    ),
     **dict.fromkeys(("config", "set"), "hold other options, see test_used_settings.py"),
     "seed": "common to all commands, and some draw nothing",
     "engine": "other engines give equal results up to rounding",
@@ -99,7 +103,9 @@ class Runner:
 
 
 @pytest.fixture(scope="module")
-def runner(inputs: Path, tmp_path_factory: pytest.TempPathFactory, command_line: CommandLine) -> Runner:
+def runner(
+    inputs: Path, tmp_path_factory: pytest.TempPathFactory, command_line: CommandLine
+) -> Runner:
     return Runner(inputs, tmp_path_factory.mktemp("runs"), command_line)
 
 
@@ -118,7 +124,9 @@ CASES = [(command, name, "") for command, table in VALUES.items() for name in ta
 
 
 @pytest.mark.parametrize(("command", "option", "preset"), CASES)
-def test_an_option_changes_the_result(command: str, option: str, preset: str, runner: Runner) -> None:
+def test_an_option_changes_the_result(
+    command: str, option: str, preset: str, runner: Runner
+) -> None:
     usual = runner.base(command, option, preset)
     given = f"{flag_of(command, option)} {VALUES[command][option]}"
     words = f"{_base(command, option, preset)} {given}"
@@ -134,7 +142,9 @@ def test_an_option_changes_the_result(command: str, option: str, preset: str, ru
 
 
 @pytest.mark.parametrize("command", VALUES)
-def test_a_config_file_says_the_same_as_flags(command: str, inputs: Path, command_line: CommandLine) -> None:
+def test_a_config_file_says_the_same_as_flags(
+    command: str, inputs: Path, command_line: CommandLine
+) -> None:
     """So does the config that is printed of either."""
     file = inputs / f"{command}.toml"
 
@@ -146,12 +156,14 @@ def test_a_config_file_says_the_same_as_flags(command: str, inputs: Path, comman
         parameter, flag = options_of(command)[option], flag_of(command, option)
         excluded = ["views"] * (option == "no_views")
         words = without(_base(command, option).split(), option, *excluded)
-        value, more = ("", given.split()) if parameter.is_flag else (given.split()[0], given.split()[1:])
+        value, more = (
+            ("", given.split()) if parameter.is_flag else (given.split()[0], given.split()[1:])
+        )
         by_flag = config([*words, flag, *given.split()], "")
         on = json.dumps(value or flag not in parameter.secondary_opts)
-        key = max((found for found in parameter.opts if found[:2] == "--"), key=len, default=option).lstrip(
-            "-"
-        )
+        key = max(
+            (found for found in parameter.opts if found[:2] == "--"), key=len, default=option
+        ).lstrip("-")
         rest = without([command, *more], option)[1:]
         assert config([*words, *rest], f"{key} = {on}\n") == by_flag, option
         assert config([command], by_flag.partition("\n")[2]) == by_flag, option

@@ -37,25 +37,38 @@ COMMANDS = {
 
 
 @pytest.mark.parametrize("name", COMMANDS)
-def test_far_rows_are_named_before_the_work(tmp_path: Path, command_line: CommandLine, name: str) -> None:
+def test_far_rows_are_named_before_the_work(
+    tmp_path: Path, command_line: CommandLine, name: str
+) -> None:
     rows = [20, 3, 599, 100]
     scene = spoiled(tmp_path, rows, 3e7, True)
     status, out, err = command_line(*COMMANDS[name].split(), cwd=tmp_path)
     assert (status, out) == (1, "")
     assert f"row {min(rows)}" in err
     assert not re.search("simplify:|recover:|teacher:|pack:", err)
-    assert not any((tmp_path / place).exists() for place in ("out", "out.spz", "out.glb", "run/scene.spz"))
+    assert not any(
+        (tmp_path / place).exists() for place in ("out", "out.spz", "out.glb", "run/scene.spz")
+    )
     box = [float(v) for v in re.search(r"--box=([-\d.,]+\d)", err)[1].split(",")]
     assert len(convert(scene, box=box)) == len(scene) - len(rows)
 
 
-def test_wider_gaussians_of_a_reduction_need_fewer_steps(tmp_path: Path, command_line: CommandLine) -> None:
+def test_wider_gaussians_of_a_reduction_need_fewer_steps(
+    tmp_path: Path, command_line: CommandLine
+) -> None:
     """A scene that only its reduction fits into the format is not refused."""
     scene = spoiled(tmp_path, [7], 2.0**12 * 1000, False)
     step = 2.0**12 * 1000 / 2**22
     scale = step / 2
     g2ard.save(
-        tmp_path / "scene.ply", replace(scene, scales=np.full_like(scene.scales, scale)), overwrite=True
+        tmp_path / "scene.ply",
+        replace(scene, scales=np.full_like(scene.scales, scale)),
+        overwrite=True,
     )
     assert command_line("convert", "scene.ply", "a.spz", cwd=tmp_path)[0] == 1
-    assert command_line("simplify", "scene.ply", "-r", 20, "--no-views", "-o", "b.spz", cwd=tmp_path)[0] == 0
+    assert (
+        command_line("simplify", "scene.ply", "-r", 20, "--no-views", "-o", "b.spz", cwd=tmp_path)[
+            0
+        ]
+        == 0
+    )

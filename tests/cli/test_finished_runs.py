@@ -53,7 +53,9 @@ def put(path: Path, content: bytes) -> None:
 
 
 @pytest.mark.parametrize("name", COMMANDS)
-def test_what_is_found_beside_views_is_an_input(name: str, project: Path, command_line: CommandLine) -> None:
+def test_what_is_found_beside_views_is_an_input(
+    name: str, project: Path, command_line: CommandLine
+) -> None:
     """It counts if it is new, changed or gone since."""
     words = COMMANDS[name].split()
     succeeds(command_line, project, *words)

@@ -40,7 +40,9 @@ def test_a_missing_output_names_the_commands_own_options(
 
 
 @pytest.mark.parametrize("name", ["run.ply", "run.sog", "a.spz", "page.html"])
-@pytest.mark.parametrize("command", ["distill absent.ply -n 5", "lod absent.ply", "ingest absent.ply"])
+@pytest.mark.parametrize(
+    "command", ["distill absent.ply -n 5", "lod absent.ply", "ingest absent.ply"]
+)
 def test_a_files_name_for_a_folder_is_refused(
     command: str, name: str, command_line: CommandLine, folder: Path
 ) -> None:
@@ -49,7 +51,9 @@ def test_a_files_name_for_a_folder_is_refused(
     assert not (folder / name).exists()
 
 
-def test_save_refuses_an_existing_file_before_the_work(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_save_refuses_an_existing_file_before_the_work(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     from g2ard.io import sog_write
 
     (folder / "a.sog").write_bytes(b"mine")
@@ -96,7 +100,20 @@ def test_a_file_that_fits_needs_nothing(folder: Path, command_line: CommandLine)
 
 def test_photos_alone_are_counted_as_photos(tmp_path: Path, command_line: CommandLine) -> None:
     photos_of(tmp_path / "shots", count=9)
-    ask = ("distill", "--views", "shots", "-n", 60, "--steps", 2, "--no-page", "-o", "run", "--format", "sog")
+    ask = (
+        "distill",
+        "--views",
+        "shots",
+        "-n",
+        60,
+        "--steps",
+        2,
+        "--no-page",
+        "-o",
+        "run",
+        "--format",
+        "sog",
+    )
     told = succeeds(command_line, tmp_path, *ask).err
     assert re.findall(r"(?m)^(\d+ \w+) → 60 Gaussians", told) == ["7 photos"] * 2
     assert re.search(r"(?m)^7 photos → 60 Gaussians, [\d.]+ MB as .sog; ", told)
@@ -125,4 +142,6 @@ def test_progress_and_summary_use_the_same_words(tmp_path: Path) -> None:
     assert not {"teacher", "rates"} & stages
     told: list[str] = []
     tell_start(SimpleNamespace(say=told.append), tmp_path / "work", Path("run"))  # type: ignore[arg-type]
-    assert re.fullmatch(r"run: continues (after [\w, -]+|from step \d+|after .* from step \d+)", told[0])
+    assert re.fullmatch(
+        r"run: continues (after [\w, -]+|from step \d+|after .* from step \d+)", told[0]
+    )

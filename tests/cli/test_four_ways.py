@@ -87,7 +87,9 @@ def _bytes(output: Path) -> bytes:
 
 
 @pytest.mark.parametrize("command", GIVEN)
-def test_the_ways_agree(command: str, inputs: Path, tmp_path: Path, command_line: CommandLine) -> None:
+def test_the_ways_agree(
+    command: str, inputs: Path, tmp_path: Path, command_line: CommandLine
+) -> None:
     """All options of a command at once, so that none is lost on any way."""
     folder, words = shutil.copytree(inputs, tmp_path / "files"), CALLS[command].split()
 
@@ -102,5 +104,7 @@ def test_the_ways_agree(command: str, inputs: Path, tmp_path: Path, command_line
     (folder / "c.toml").write_text(f"[{command}]\n{table}")
     assert run("--config", "c.toml") == expected
     if command in SETTINGS:
-        settings = [word for name, text in _values(command).items() for word in ("--set", f"{name}={text}")]
+        settings = [
+            word for name, text in _values(command).items() for word in ("--set", f"{name}={text}")
+        ]
         assert run(*settings) == expected

@@ -47,7 +47,9 @@ def test_help_shows_twelve_options_at_most_in_order_of_use(
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_help_all_shows_every_option_once(command: str, command_line: CommandLine, tmp_path: Path) -> None:
+def test_help_all_shows_every_option_once(
+    command: str, command_line: CommandLine, tmp_path: Path
+) -> None:
     options = options_of(command)
     status, text, _ = command_line(command, "--help-all", "--unknown", cwd=tmp_path)
     assert status == 0
@@ -62,7 +64,9 @@ def test_options_without_effect_are_left_out() -> None:
         assert not {"seed", "threads", "device"} & set(options_of(command))
     for command in COMMANDS:  # whatever takes a seed uses it
         text = (ROOT / "g2ard" / "cli" / "commands" / f"{command}.py").read_text(encoding="utf-8")
-        assert ("seed" in options_of(command)) == ("seed" in text.replace('without=("seed"', "")), command
+        assert ("seed" in options_of(command)) == ("seed" in text.replace('without=("seed"', "")), (
+            command
+        )
 
 
 def test_a_flag_is_taken_by_its_former_spelling(command_line: CommandLine, tmp_path: Path) -> None:
@@ -73,6 +77,8 @@ def test_a_flag_is_taken_by_its_former_spelling(command_line: CommandLine, tmp_p
 
 def test_lines_of_the_list_are_those_of_the_commands() -> None:
     for command, line in COMMANDS.items():
-        tree = ast.parse((ROOT / "g2ard" / "cli" / "commands" / f"{command}.py").read_text(encoding="utf-8"))
+        tree = ast.parse(
+            (ROOT / "g2ard" / "cli" / "commands" / f"{command}.py").read_text(encoding="utf-8")
+        )
         (function,) = [n for n in tree.body if isinstance(n, ast.FunctionDef) and n.name == command]
         assert (ast.get_docstring(function) or "").split("\n\n")[0] == line

@@ -37,7 +37,12 @@ def test_scene(tmp_path: Path) -> None:
     path = tmp_path / "a.ply"
     splats = scene(path)
     found = describe(path)
-    assert (found["kind"], found["format"], found["count"], found["sh_degree"]) == ("splats", "ply", 400, 2)
+    assert (found["kind"], found["format"], found["count"], found["sh_degree"]) == (
+        "splats",
+        "ply",
+        400,
+        2,
+    )
     assert found["bytes"] == path.stat().st_size
     assert found["bytes_as_ply"] == 400 * 4 * (14 + 24)
     world = splats.means.astype(np.float32) + splats.offset
@@ -60,7 +65,9 @@ def test_close_views_blend_more_gaussians(tmp_path: Path, command_line: CommandL
         assert 1 < found[name]["mean"] <= found[name]["worst"]
     assert found["huge.ply"]["mean"] > 2 * found["a.ply"]["mean"]
     assert "Gaussians per pixel, near" in succeeds(command_line, tmp_path, "info", "a.ply").out
-    write_splats(tmp_path / "clear.ply", replace(ball, logit_opacities=np.full(1000, -15, np.float32)))
+    write_splats(
+        tmp_path / "clear.ply", replace(ball, logit_opacities=np.full(1000, -15, np.float32))
+    )
     printed = succeeds(command_line, tmp_path, "info", "clear.ply", "--json", "-")
     assert "close_overdraw" not in json.loads(printed.out)
 
@@ -74,7 +81,9 @@ def test_cloud(tmp_path: Path) -> None:
     np.testing.assert_allclose(found["color"]["mean"], [0.2] * 3, atol=1e-6)
 
 
-def test_a_scene_in_a_file_of_another_format_is_named(tmp_path: Path, command_line: CommandLine) -> None:
+def test_a_scene_in_a_file_of_another_format_is_named(
+    tmp_path: Path, command_line: CommandLine
+) -> None:
     scene(tmp_path / "a.ply")
     (tmp_path / "a.ply").rename(tmp_path / "a.sog")
     error = refused(command_line, tmp_path, "info", "a.sog", status=1)
@@ -120,12 +129,25 @@ def test_playbot_matches_its_readme() -> None:
     assert (found["count"], found["sh_degree"], found["notes"]) == (500_000, 2, [])
     np.testing.assert_allclose(found["extent"]["min"], [-1.03, -1.08, -1.04], atol=0.005)
     opacities = [found["opacity"][q] for q in ("0", "1", "25", "50", "75", "99", "100")]
-    np.testing.assert_allclose(opacities, [0.020, 0.090, 0.42, 0.68, 0.90, 0.996, 0.996], atol=0.005)
+    np.testing.assert_allclose(
+        opacities, [0.020, 0.090, 0.42, 0.68, 0.90, 0.996, 0.996], atol=0.005
+    )
 
 
 def test_info_of_several_files_and_of_a_run(command_line: CommandLine, folder: Path) -> None:
     command_line(
-        "distill", "ball.ply", "-r", 10, "-o", "run", "--steps", 4, "--size", 48, "--no-page", cwd=folder
+        "distill",
+        "ball.ply",
+        "-r",
+        10,
+        "-o",
+        "run",
+        "--steps",
+        4,
+        "--size",
+        48,
+        "--no-page",
+        cwd=folder,
     )
     out = succeeds(command_line, folder, "info", "ball.ply", "views.json", "run", "--json", "-").out
     scene, views, made = json.loads(out)["files"]
@@ -153,10 +175,13 @@ def test_info_continues_after_unreadable_files(command_line: CommandLine, folder
     assert [figures["kind"] for figures in result["files"]] == ["splats", "views"]
 
 
-def test_a_point_cloud_states_its_unit_and_rounded_figures(tmp_path: Path, command_line: CommandLine) -> None:
+def test_a_point_cloud_states_its_unit_and_rounded_figures(
+    tmp_path: Path, command_line: CommandLine
+) -> None:
     colors = np.tile([[156, 153, 136]], (3, 1)).astype(np.uint8)
     write_points(
-        tmp_path / "a.ply", Points(np.array([[0, 0, 0], [2000.123, 10, 5], [9, 9, 9]]), colors / 255)
+        tmp_path / "a.ply",
+        Points(np.array([[0, 0, 0], [2000.123, 10, 5], [9, 9, 9]]), colors / 255),
     )
     told = succeeds(command_line, tmp_path, "info", "a.ply").out
     assert re.search(r"unit\W+not stated in the file", told)

@@ -29,7 +29,9 @@ def test_simplify_lifts_a_point_cloud_as_lift_does(command_line: CommandLine, fo
     photos_of(folder / "photos", points=True)
     cloud = "photos/sparse.ply"
     succeeds(command_line, folder, "lift", cloud, "-o", "lifted.ply")
-    succeeds(command_line, folder, "simplify", "lifted.ply", "-r", 4, "--method", "fast", "-o", "two.ply")
+    succeeds(
+        command_line, folder, "simplify", "lifted.ply", "-r", 4, "--method", "fast", "-o", "two.ply"
+    )
     ask = ("simplify", cloud, "-r", 4, "--method", "fast", "-o", "one.ply", "--memory", "8GB")
     told = succeeds(command_line, folder, *ask).err
     points = len(g2ard.load_points(folder / cloud))
@@ -61,14 +63,18 @@ def test_errors_point_to_the_poses_of_photos(folder: Path) -> None:
         g2ard.load_views(shots)
 
 
-def test_an_unreadable_folder_names_readable_contents(command_line: CommandLine, folder: Path) -> None:
+def test_an_unreadable_folder_names_readable_contents(
+    command_line: CommandLine, folder: Path
+) -> None:
     for name in ("bare/photo.jpg", "project/images/photo.PNG", "empty"):
         place = folder / name
         (place.parent if place.suffix else place).mkdir(parents=True, exist_ok=True)
         if place.suffix:
             Image.new("RGB", (16, 16)).save(place)
     for name, photos in (("bare", "bare"), ("project", "project/images")):
-        error = refused(command_line, folder, "distill", "--views", name, "-n", 9, "-o", "x", status=1)
+        error = refused(
+            command_line, folder, "distill", "--views", name, "-n", 9, "-o", "x", status=1
+        )
         assert "photos without poses: estimate them with `colmap automatic_recon" in error
         assert f"--image_path {photos}` and give project" in error
     assert "looked for SOG's meta.json" in refused(command_line, folder, "info", "empty", status=1)
@@ -91,13 +97,18 @@ def test_views_without_photos_name_the_substitute(command_line: CommandLine, fol
     to = ("-r", 4, "-o", "x", "--views", "views.json")
     for ask, words in (
         (("distill", "ball.ply", *to, "--photos"), "leave out --photos to render the scene there"),
-        (("distill", "cloud.ply", *to), "give views with photos, their --images DIR, or a trained scene"),
+        (
+            ("distill", "cloud.ply", *to),
+            "give views with photos, their --images DIR, or a trained scene",
+        ),
         (("distill", *to[2:], "-n", 50), "pass views with photos, their --images DIR, or a scene"),
         (("recover", "ball.ply", "-o", "x.ply", *to[4:]), "render them from --teacher SCENE"),
     ):
         status, _, error = command_line(*ask, cwd=folder)
         last = error.splitlines()[-1]
-        assert (status, "has no" in last or "has none" in last, words in last) == (1, True, True), error
+        assert (status, "has no" in last or "has none" in last, words in last) == (1, True, True), (
+            error
+        )
 
 
 def test_a_cloud_without_photos_is_its_own_teacher(command_line: CommandLine, folder: Path) -> None:
@@ -105,14 +116,18 @@ def test_a_cloud_without_photos_is_its_own_teacher(command_line: CommandLine, fo
     cloud_of(folder / "alone" / "cloud.ply", BALL)
     ask = ("distill", "alone/cloud.ply", "-n", 100, "-o", "alone/run", "--steps", 5, "--size", 48)
     status, _, error = command_line(*ask, cwd=folder)
-    assert (status, "no photos: the lifted points render the training images" in error) == (0, True), error
+    assert (status, "no photos: the lifted points render the training images" in error) == (
+        0,
+        True,
+    ), error
     assert len(g2ard.load(folder / "alone" / "run" / "scene.ply")) == 100
 
 
 def test_gaps_are_told(command_line: CommandLine, folder: Path) -> None:
     x, y = np.meshgrid(np.arange(40.0), np.arange(40.0))
     g2ard.save(
-        folder / "floor.ply", g2ard.lift(np.stack([x, y, 0 * x], 2).reshape(-1, 3), np.full((1600, 3), 0.5))
+        folder / "floor.ply",
+        g2ard.lift(np.stack([x, y, 0 * x], 2).reshape(-1, 3), np.full((1600, 3), 0.5)),
     )
     for ratio, told in ((2, False), (100, True)):
         status, _, error = command_line(
@@ -137,7 +152,9 @@ def test_a_name_without_a_similar_one_gets_no_suggestion(folder: Path) -> None:
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".sog", ".spz", ".glb"])
-def test_a_damaged_file_comes_with_advice(suffix: str, command_line: CommandLine, folder: Path) -> None:
+def test_a_damaged_file_comes_with_advice(
+    suffix: str, command_line: CommandLine, folder: Path
+) -> None:
     g2ard.save(folder / f"a{suffix}", BALL)
     (folder / f"b{suffix}").write_bytes((folder / f"a{suffix}").read_bytes()[:-700])
     error = refused(command_line, folder, "info", f"b{suffix}", status=1)

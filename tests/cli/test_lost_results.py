@@ -27,7 +27,13 @@ SLOW = {
     "register": ("g2ard.stages.register.register",),
 }
 """Functions before the first output; they are called once, because only what follows is tested."""
-SAME_ENDS = ("distill tiles", "recover a folder", "ingest a cloud", "lod with recovery", "lod tiles")
+SAME_ENDS = (
+    "distill tiles",
+    "recover a folder",
+    "ingest a cloud",
+    "lod with recovery",
+    "lod tiles",
+)
 """Calls that end like another one of their command."""
 
 
@@ -43,10 +49,15 @@ def _once(function: Callable[..., Any]) -> Callable[..., Any]:
 
 @pytest.mark.parametrize("name", [name for name in WRITING if name not in SAME_ENDS])
 def test_a_failure_after_the_result_loses_nothing(
-    name: str, inputs: Path, tmp_path: Path, command_line: CommandLine, monkeypatch: pytest.MonkeyPatch
+    name: str,
+    inputs: Path,
+    tmp_path: Path,
+    command_line: CommandLine,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     words, output = [*CALLS[name].split(), "--json", "told.json"], output_of(name)
-    slow = {path: resolve_name(path) for paths in SLOW.values() for path in paths}  # all imported unpatched
+    # all imported unpatched
+    slow = {path: resolve_name(path) for paths in SLOW.values() for path in paths}
     for path in SLOW.get(words[0], ()):
         monkeypatch.setattr(path, _once(slow[path]))
     shutil.copytree(inputs, tmp_path / "0")
@@ -61,16 +72,33 @@ def test_a_failure_after_the_result_loses_nothing(
         assert (status, line[:7]) == (1, "g2ard: "), (stage, error)
         assert INJECTED in line, (stage, error)
         place = re.escape(re.sub("/(lod-meta|tiles|tileset).json", "", output))
-        assert re.search(rf"{place} is written|{place.partition('/')[0]} is finished", line), (stage, error)
+        assert re.search(rf"{place} is written|{place.partition('/')[0]} is finished", line), (
+            stage,
+            error,
+        )
         for path in [folder / output, *(folder / output).glob("*")][-1:]:
-            assert path.read_bytes() == (tmp_path / "0" / path.relative_to(folder)).read_bytes(), stage
+            assert path.read_bytes() == (tmp_path / "0" / path.relative_to(folder)).read_bytes(), (
+                stage
+            )
 
 
 def test_a_run_whose_scores_failed_is_resumed(
     inputs: Path, tmp_path: Path, command_line: CommandLine, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder = shutil.copytree(inputs, tmp_path / "inputs")
-    ask = ("distill", "ball.ply", "-r", 8, "--steps", 2, "--views", "views.json", "--no-page", "-o", "run")
+    ask = (
+        "distill",
+        "ball.ply",
+        "-r",
+        8,
+        "--steps",
+        2,
+        "--views",
+        "views.json",
+        "--no-page",
+        "-o",
+        "run",
+    )
     ask = (*ask, "--focus", "far")
     with stages_after(folder / "run" / "scene.ply", failing="g2ard.jobs.scoring.describe_run"):
         line = refused(command_line, folder, *ask, "-q", status=1)

@@ -88,7 +88,8 @@ class Watched:
         for name, kernel in list(vars(_core).items()):
             if isinstance(kernel, BuiltinFunctionType) and name not in CHEAP:
                 monkeypatch.setattr(_core, name, partial(self._call, kernel))
-        detect_file, open_source = detect._of_file.__wrapped__, Source._opened  # the former without its cache
+        # the former without its cache
+        detect_file, open_source = detect._of_file.__wrapped__, Source._opened
 
         def detecting(path: Path, *more: Any) -> Any:
             self.detected[path.resolve().name] += 1
@@ -168,7 +169,9 @@ READING = [
 @pytest.mark.parametrize("words", READING)
 def test_an_input_is_opened_once(words: str, inputs: Path, ran: Ran) -> None:
     _, watched = ran(words)
-    given = Counter(word for word in words.split() if word.endswith(".ply") and (inputs / word).exists())
+    given = Counter(
+        word for word in words.split() if word.endswith(".ply") and (inputs / word).exists()
+    )
     assert given
     for name, times in given.items():  # a scene may be the teacher too
         assert (watched.detected[name], watched.opened[name]) == (times, times), name
@@ -196,7 +199,11 @@ def test_outputs_are_replaced_only_on_request(
 
 @pytest.mark.parametrize("name", FIRST)
 def test_one_of_two_runs_writes_the_output(
-    name: str, inputs: Path, tmp_path: Path, command_line: CommandLine, monkeypatch: pytest.MonkeyPatch
+    name: str,
+    inputs: Path,
+    tmp_path: Path,
+    command_line: CommandLine,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """The other run begins when the first has read its inputs."""
     folder, words = shutil.copytree(inputs, tmp_path / "files"), CALLS[name].split()
@@ -213,7 +220,9 @@ def test_one_of_two_runs_writes_the_output(
     runs.append(command_line(*words, cwd=folder))
     assert sorted(status for status, _, _ in runs) == [0, 1], runs
     error = next(error for status, _, error in runs if status)
-    assert re.search(rf"\b{words[-1].partition('/')[0]}: (in use by process|exists; -w)", error), error
+    assert re.search(rf"\b{words[-1].partition('/')[0]}: (in use by process|exists; -w)", error), (
+        error
+    )
     assert not list(folder.glob("**/*.lock"))
 
 
@@ -287,18 +296,25 @@ def test_another_file_at_the_output_is_not_the_finished_one(
 
 _COUNTED = ("replace", "link", "rename", "unlink", "rmdir")
 _MOMENTS = 3
-KILLED = [name for name in REPEATED if name not in ("distill a page", "lod")]  # others write as these do
+# others write as these do
+KILLED = [name for name in REPEATED if name not in ("distill a page", "lod")]
 
 
-@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs os.fork, to kill a process at a chosen moment")
+@pytest.mark.skipif(
+    not hasattr(os, "fork"), reason="needs os.fork, to kill a process at a chosen moment"
+)
 @pytest.mark.parametrize("name", KILLED)
-def test_the_same_command_after_a_kill_ends_and_cleans_up(name: str, inputs: Path, tmp_path: Path) -> None:
+def test_the_same_command_after_a_kill_ends_and_cleans_up(
+    name: str, inputs: Path, tmp_path: Path
+) -> None:
     """The kills come alternately before and after a file is put in place."""
     words, logs = [*CALLS[name].split(), *["--resume"] * (name in RESUMED)], tmp_path / "logs"
     logs.mkdir()
 
     def run(label: str, folder: Path, after: int = 0) -> tuple[int, str]:
-        work = killed(command(words), after, logs / "count", functions=_COUNTED, before=after % 2 == 0)
+        work = killed(
+            command(words), after, logs / "count", functions=_COUNTED, before=after % 2 == 0
+        )
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", DeprecationWarning)  # forking with threads
             status = forked(work, logs / f"{label}.out", logs / f"{label}.err", folder)
@@ -310,11 +326,15 @@ def test_the_same_command_after_a_kill_ends_and_cleans_up(name: str, inputs: Pat
     hidden = [file for file in whole if re.search(r"(^|/)\.", file)]
     assert not hidden
     assert count > 2
-    for after in sorted({1 + round(i * (count - 1) / (_MOMENTS - 1)) for i in range(_MOMENTS)} | {count - 1}):
+    for after in sorted(
+        {1 + round(i * (count - 1) / (_MOMENTS - 1)) for i in range(_MOMENTS)} | {count - 1}
+    ):
         folder = shutil.copytree(inputs, tmp_path / str(after))
         assert run(f"killed{after}", folder, after)[0] == -9
         status, error = run(f"again{after}", folder)
         assert status == 0, f"killed at {after} of {count}: {error}"
         again = left(folder)
         assert again.keys() == whole.keys(), f"killed at {after} of {count}"
-        assert [file for file in whole if again[file] != whole[file]] == [], f"killed at {after} of {count}"
+        assert [file for file in whole if again[file] != whole[file]] == [], (
+            f"killed at {after} of {count}"
+        )

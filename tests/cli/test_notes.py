@@ -57,7 +57,20 @@ def test_a_run_that_time_ends_says_so(command_line: CommandLine, tmp_path: Path)
 
 
 def test_one_is_one(command_line: CommandLine, folder: Path) -> None:
-    ask = ("distill", "ball.ply", "-n", 1, "-o", "run", "--steps", 2, "--size", 32, "--format", "splat")
+    ask = (
+        "distill",
+        "ball.ply",
+        "-n",
+        1,
+        "-o",
+        "run",
+        "--steps",
+        2,
+        "--size",
+        32,
+        "--format",
+        "splat",
+    )
     error = succeeds(command_line, folder, *ask).err
     assert "400 → 1 Gaussian;" in error
     assert "MB as .ply" in error
@@ -66,7 +79,9 @@ def test_one_is_one(command_line: CommandLine, folder: Path) -> None:
     error += "".join(command_line("info", "run", cwd=folder)[1:])
     ask = ("evaluate", "s.ply", "--teacher", "s.ply", "--views", "views.json", "--size", 16)
     error += command_line(*ask, cwd=folder)[2]
-    assert re.findall(r"(?<![\d.,])1 [A-Za-z]*(?:Gaussian|view|step|point|photo|disc)s\b", error) == []
+    assert (
+        re.findall(r"(?<![\d.,])1 [A-Za-z]*(?:Gaussian|view|step|point|photo|disc)s\b", error) == []
+    )
 
 
 @pytest.mark.parametrize(
@@ -124,4 +139,6 @@ def test_photos_of_another_world_are_refused(
     assert sorted(folder.iterdir()) == before
     for scene, warned in (("other.ply", True), ("own.ply", False)):
         error = succeeds(command_line, folder, command, scene, *ask, "--photos", "-w").err
-        assert ("warning: the scene does not look like the photos (correlation" in error) == warned, error
+        assert (
+            "warning: the scene does not look like the photos (correlation" in error
+        ) == warned, error

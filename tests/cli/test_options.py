@@ -31,12 +31,16 @@ def folder(tmp_path: Path) -> Path:
         ("--threads", "1000", "'--threads': expected a whole number from 0 to 256, got '1000'"),
     ],
 )
-def test_invalid_values(folder: Path, command_line: CommandLine, option: str, value: str, words: str) -> None:
+def test_invalid_values(
+    folder: Path, command_line: CommandLine, option: str, value: str, words: str
+) -> None:
     simplify = ("simplify", "a.ply", "-n", 5, "-o", "o.ply")
     assert words in refused(command_line, folder, *simplify, option, value)
     table = f'[simplify]\n{option[2:]} = "{value}"\n'
     (folder / "c.toml").write_text(table)
-    assert f"{words} (from c.toml)" in refused(command_line, folder, *simplify, "--config", "c.toml")
+    assert f"{words} (from c.toml)" in refused(
+        command_line, folder, *simplify, "--config", "c.toml"
+    )
 
 
 def test_up_changes_the_generated_views(folder: Path, command_line: CommandLine) -> None:
@@ -48,8 +52,12 @@ def test_up_changes_the_generated_views(folder: Path, command_line: CommandLine)
     assert upright != lying
 
 
-def test_a_flag_wins_over_what_it_excludes_in_the_config(folder: Path, command_line: CommandLine) -> None:
-    (folder / "c.toml").write_text("[simplify]\ncount = 50\nno-views = true\n[recover]\nsteps = 100000\n")
+def test_a_flag_wins_over_what_it_excludes_in_the_config(
+    folder: Path, command_line: CommandLine
+) -> None:
+    (folder / "c.toml").write_text(
+        "[simplify]\ncount = 50\nno-views = true\n[recover]\nsteps = 100000\n"
+    )
     for arguments, count in ((("-r", 10), 20), ((), 50), (("--views", "views.json"), 50)):
         ask = ("simplify", "a.ply", *arguments, "-o", "small.ply", "-w", "--config", "c.toml")
         succeeds(command_line, folder, *ask)
@@ -85,7 +93,8 @@ def test_the_folder_one_is_in_can_be_an_output(folder: Path, command_line: Comma
 )
 @pytest.mark.parametrize(("by", "status"), [("SIGINT", 130), ("SIGTERM", 143)])
 def test_a_signal_before_a_command_is_one_line(moment: str, by: str, status: int) -> None:
-    unignored = "signal.signal(signal.SIGINT, signal.default_int_handler)"  # ignored in background jobs
+    # ignored in background jobs
+    unignored = "signal.signal(signal.SIGINT, signal.default_int_handler)"
     moment = moment.replace("SIGINT", by)
     code = f"import signal, sys\n{unignored}\n{moment}from g2ard.__main__ import main\nmain()"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
@@ -98,7 +107,17 @@ def test_recover_reports_losing_steps(tmp_path: Path, command_line: CommandLine)
     write_splats(tmp_path / "ball.ply", ball)
     write_splats(tmp_path / "start.ply", replace(ball, sh0=ball.sh0 + grain))
     write_views(tmp_path / "v.json", around(6))
-    asked = ("recover", "start.ply", "--views", "v.json", "--teacher", "ball.ply", "-o", "o.ply", "-w")
+    asked = (
+        "recover",
+        "start.ply",
+        "--views",
+        "v.json",
+        "--teacher",
+        "ball.ply",
+        "-o",
+        "o.ply",
+        "-w",
+    )
     for steps, words in ((4, "kept the start: every step made"), (24, "recovery fell to ")):
         told = succeeds(command_line, tmp_path, *asked, "--steps", steps).err
         assert sum(words in line for line in told.splitlines()) == 1

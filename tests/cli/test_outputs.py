@@ -14,7 +14,9 @@ from helpers.systems import needs_links
 
 
 def contents(folder: Path) -> dict[Path, bytes]:
-    return {path.relative_to(folder): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    return {
+        path.relative_to(folder): path.read_bytes() for path in folder.rglob("*") if path.is_file()
+    }
 
 
 VIEWED = "--views views.json --steps 2 --size 24"
@@ -99,7 +101,9 @@ OTHER = "simplify c -r 8 --no-views -o a.ply --json"
         "convert ball.ply -o ball.ply",
     ],
 )
-def test_inputs_are_kept(commands: str, inputs: Path, tmp_path: Path, command_line: CommandLine) -> None:
+def test_inputs_are_kept(
+    commands: str, inputs: Path, tmp_path: Path, command_line: CommandLine
+) -> None:
     """The last command is refused, also where its input is a folder that holds the output."""
     folder = shutil.copytree(inputs, tmp_path / "a")
     if "link" in commands:
@@ -109,7 +113,9 @@ def test_inputs_are_kept(commands: str, inputs: Path, tmp_path: Path, command_li
     for words in made:
         succeeds(command_line, folder, *words.split())
     before = contents(folder)
-    assert "is both an input and the output" in refused(command_line, folder, *command.split(), "-w")
+    assert "is both an input and the output" in refused(
+        command_line, folder, *command.split(), "-w"
+    )
     assert contents(folder) == before
 
 
@@ -130,11 +136,22 @@ def test_outputs_may_share_a_folder(
         succeeds(command_line, folder, *command.split(), *words)
 
 
-def test_folders_are_made_and_suffixes_are_of_any_case(command_line: CommandLine, folder: Path) -> None:
+def test_folders_are_made_and_suffixes_are_of_any_case(
+    command_line: CommandLine, folder: Path
+) -> None:
     g2ard.save(folder / "a" / "b" / "ball.PLY", BALL)
     assert len(g2ard.load(folder / "a" / "b" / "ball.PLY")) == 1200
     succeeds(
-        command_line, folder, "simplify", "a/b/ball.PLY", "-r", 4, "-o", "c/d/small.Ply", "--json", "e/f.json"
+        command_line,
+        folder,
+        "simplify",
+        "a/b/ball.PLY",
+        "-r",
+        4,
+        "-o",
+        "c/d/small.Ply",
+        "--json",
+        "e/f.json",
     )
     assert json.loads((folder / "e" / "f.json").read_text())["output_count"] == 300
     assert len(g2ard.load(folder / "c" / "d" / "small.Ply")) == 300
@@ -158,7 +175,11 @@ def test_a_pictures_suffix_is_of_any_case(command_line: CommandLine, folder: Pat
         assert picture.format == "PNG"
 
 
-@pytest.mark.parametrize("name", ["{1A2B-3C}/s.ply", "{backup}/s.ply", "s{v2}.ply", "{A}_{ratio}x.ply"])
-def test_braces_that_are_no_placeholders(command_line: CommandLine, folder: Path, name: str) -> None:
+@pytest.mark.parametrize(
+    "name", ["{1A2B-3C}/s.ply", "{backup}/s.ply", "s{v2}.ply", "{A}_{ratio}x.ply"]
+)
+def test_braces_that_are_no_placeholders(
+    command_line: CommandLine, folder: Path, name: str
+) -> None:
     succeeds(command_line, folder, "simplify", "ball.ply", "-r", "4", "-o", name)
     assert (folder / name.replace("{ratio}", "4")).is_file()

@@ -20,7 +20,9 @@ from helpers.commands import CommandLine, refused, succeeds
 from helpers.photos import photos_of
 from helpers.scenes import checkered_ball
 
-OTHER_WORDS = re.compile(r"\b(teacher|student|reference|original|recovered|distilled|prior)\b", re.I)
+OTHER_WORDS = re.compile(
+    r"\b(teacher|student|reference|original|recovered|distilled|prior)\b", re.I
+)
 """Words that nobody reads for the dense scene, the target or the result."""
 
 
@@ -37,7 +39,9 @@ class Text(HTMLParser):
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         self._inside = tag, dict(attrs)
-        self.text += "".join(f"\n{value}" for key, value in attrs if key in ("alt", "title", "aria-label"))
+        self.text += "".join(
+            f"\n{value}" for key, value in attrs if key in ("alt", "title", "aria-label")
+        )
 
     def handle_endtag(self, tag: str) -> None:
         self._inside = "", {}
@@ -54,7 +58,10 @@ class Text(HTMLParser):
 
 BOTH = ["dense scene: ball.ply, 400 Gaussians", "result: run, 50 Gaussians"]
 PAGES: dict[str, tuple[str | None, list[str]]] = {
-    "run/view.html": ("distill ball.ply -r 8 --views views.json --steps 2 --size 24 --page -o run", BOTH),
+    "run/view.html": (
+        "distill ball.ply -r 8 --views views.json --steps 2 --size 24 --page -o run",
+        BOTH,
+    ),
     "run/report.html": (None, []),
     "given.html": ("view ball.ply run -o given.html", BOTH),
     "turned.html": ("view run ball.ply -o turned.html", BOTH),
@@ -106,7 +113,9 @@ def test_pages_have_one_word_for_a_thing(page: str, made: Path) -> None:
         "view run ball.ply -w -o turned.html",
     ],
 )
-def test_messages_have_the_words_of_pages(command: str, made: Path, command_line: CommandLine) -> None:
+def test_messages_have_the_words_of_pages(
+    command: str, made: Path, command_line: CommandLine
+) -> None:
     told = "".join(succeeds(command_line, made, *command.split(), "-v"))
     told = re.sub(r"--teacher|simplified but not recovered", "", told)
     assert OTHER_WORDS.findall(told) == []
@@ -126,7 +135,9 @@ def test_a_report_opens_with_the_size_and_links_and_says_what_next(made: Path) -
     assert re.findall(r"g2ard (\w+) scene\.ply", rest) == ["distill", "lod", "adapt"]
 
 
-def test_the_preview_is_large_whatever_the_views_are(made: Path, of_photos: tuple[Path, str]) -> None:
+def test_the_preview_is_large_whatever_the_views_are(
+    made: Path, of_photos: tuple[Path, str]
+) -> None:
     for run in (made / "run", of_photos[0]):
         with Image.open(run / "preview.png") as found:
             assert 1200 <= found.width < 3000
@@ -161,7 +172,10 @@ def test_a_page_fits_its_bytes_and_holds_the_result_alone(
 
 
 def test_one_view_is_rendered_to_a_picture(made: Path, command_line: CommandLine) -> None:
-    for name, options in (("one.png", ["-k", "1", "--size", "90x60"]), ("best.png", ["--size", "90x60"])):
+    for name, options in (
+        ("one.png", ["-k", "1", "--size", "90x60"]),
+        ("best.png", ["--size", "90x60"]),
+    ):
         succeeds(command_line, made, "render", "ball.ply", *options, "-o", name)
         with Image.open(made / name) as found:
             assert found.size == (90, 60)
@@ -169,7 +183,9 @@ def test_one_view_is_rendered_to_a_picture(made: Path, command_line: CommandLine
 
 
 @pytest.fixture(scope="module")
-def of_photos(tmp_path_factory: pytest.TempPathFactory, command_line: CommandLine) -> tuple[Path, str]:
+def of_photos(
+    tmp_path_factory: pytest.TempPathFactory, command_line: CommandLine
+) -> tuple[Path, str]:
     """Return the folder of a run from photos alone, and what it printed."""
     folder = tmp_path_factory.mktemp("photos")
     photos_of(folder / "bust", points=True, count=16)
@@ -228,7 +244,9 @@ LIFT_PAGES = {
 
 
 @pytest.fixture(scope="module")
-def lifted(inputs: Path, tmp_path_factory: pytest.TempPathFactory, command_line: CommandLine) -> Path:
+def lifted(
+    inputs: Path, tmp_path_factory: pytest.TempPathFactory, command_line: CommandLine
+) -> Path:
     folder = shutil.copytree(inputs, tmp_path_factory.mktemp("lifted") / "files")
     succeeds(command_line, folder, "lift", "cloud.ply", "-o", "lifted.ply")
     return folder
@@ -247,7 +265,9 @@ def test_lifts_are_before_a_soft_gradient_unless_a_background_is_given(
         settings = json.loads(report.read_text(encoding="utf-8"))["settings"]
         assert settings["recover.background"] == list(given or BLACK)
     if given is None:
-        trained = LIFT_PAGES[page].replace("lifted.ply", "ball.ply").replace("cloud.ply", "ball.ply")
+        trained = (
+            LIFT_PAGES[page].replace("lifted.ply", "ball.ply").replace("cloud.ply", "ball.ply")
+        )
         succeeds(command_line, lifted, *trained.split(), "-w")
         assert background_of(lifted / page) == list(BLACK)
 
@@ -280,7 +300,9 @@ def test_pictures_of_lifts_have_the_sky_of_their_pages(
     assert _corner(next((tmp_path / "drawn").glob("*.png")), 0, 0) == behind
 
 
-def test_the_picture_of_a_run_has_the_sky_behind_a_lift(lifted: Path, command_line: CommandLine) -> None:
+def test_the_picture_of_a_run_has_the_sky_behind_a_lift(
+    lifted: Path, command_line: CommandLine
+) -> None:
     ask = ("distill", "-n", 60, "--steps", 2, "--size", 48, "--no-page", "-w", "-o", "run")
     corners = []
     for scene in ("cloud.ply", "ball.ply"):
@@ -294,5 +316,7 @@ def test_the_picture_of_a_run_has_the_sky_behind_a_lift(lifted: Path, command_li
 
 def test_the_sky_of_pictures_is_that_of_pages() -> None:
     style = (Path(viewer_page.__file__).parent / "page.css").read_text(encoding="utf-8")
-    colors = [tuple(bytes.fromhex(found)) for found in re.findall(r"gradient\(#(\w+), #(\w+)\)", style)[0]]
+    colors = [
+        tuple(bytes.fromhex(found)) for found in re.findall(r"gradient\(#(\w+), #(\w+)\)", style)[0]
+    ]
     assert colors == [TOP, BOTTOM]

@@ -21,7 +21,9 @@ def test_an_orbit_keeps_its_distance_and_turns_by_equal_angles() -> None:
     np.testing.assert_allclose(positions[:, 2], positions[0, 2], atol=1e-9)
     spokes = positions - middle
     assert np.ptp(np.linalg.norm(spokes, axis=1)) < 1e-9
-    turns = [float(a @ b) / float(a @ a) for a, b in zip(spokes, np.roll(spokes, -1, 0), strict=True)]
+    turns = [
+        float(a @ b) / float(a @ a) for a, b in zip(spokes, np.roll(spokes, -1, 0), strict=True)
+    ]
     np.testing.assert_allclose(turns, np.cos(np.pi / 4), atol=1e-9)
     meets = views.viewmats @ np.append(middle, 1)  # the axis passes the middle of every image
     np.testing.assert_allclose(meets[:, 0], 0, atol=1e-9)
@@ -32,7 +34,10 @@ def test_render_writes_an_animation(tmp_path: Path, command_line: CommandLine, n
     write_splats(tmp_path / "ball.ply", checkered_ball(800))
     ask = ("render", "ball.ply", "--orbit", 5, "--size", 64, "--fps", 10, "-o", name)
     assert "estimated; --up X,Y,Z sets it" in succeeds(command_line, tmp_path, *ask).err
-    assert "estimated" not in succeeds(command_line, tmp_path, *ask[:-1], "up.gif", "--up", "0,0,1").err
+    assert (
+        "estimated"
+        not in succeeds(command_line, tmp_path, *ask[:-1], "up.gif", "--up", "0,0,1").err
+    )
     with Image.open(tmp_path / name) as found:
         assert (found.n_frames, found.size) == (5, (64, 48))
         found.seek(1)
@@ -42,15 +47,22 @@ def test_render_writes_an_animation(tmp_path: Path, command_line: CommandLine, n
 
 
 @pytest.mark.parametrize(
-    ("given", "size"), [("96", (96, 72)), ("1000", (1000, 750)), ("96x54", (96, 54)), ("30x50", (30, 50))]
+    ("given", "size"),
+    [("96", (96, 72)), ("1000", (1000, 750)), ("96x54", (96, 54)), ("30x50", (30, 50))],
 )
 @pytest.mark.parametrize("views", [("--orbit", 1), ("-k", 1), ("--views", "made")])
 def test_generated_views_have_the_size_that_is_asked_for(
-    tmp_path: Path, command_line: CommandLine, views: tuple[object, ...], given: str, size: tuple[int, int]
+    tmp_path: Path,
+    command_line: CommandLine,
+    views: tuple[object, ...],
+    given: str,
+    size: tuple[int, int],
 ) -> None:
     write_splats(tmp_path / "ball.ply", checkered_ball(300))
     few = ("--split", "test") if "made" in views else ()
-    succeeds(command_line, tmp_path, "render", "ball.ply", *views, *few, "--size", given, "-o", "out")
+    succeeds(
+        command_line, tmp_path, "render", "ball.ply", *views, *few, "--size", given, "-o", "out"
+    )
     for path in (tmp_path / "out").iterdir():
         with Image.open(path) as found:
             assert found.size == size
@@ -62,7 +74,9 @@ def test_a_shape_is_for_generated_views(tmp_path: Path, command_line: CommandLin
     ask = ("render", "ball.ply", "--views", "views.json", "-o", "out", "--size")
     assert "given views keep their shape" in refused(command_line, tmp_path, *ask, "96x54")
     assert "1920x1080" in refused(command_line, tmp_path, *ask, "12")
-    assert "wide as high" in refused(command_line, tmp_path, *ask[:2], "--panorama", *ask[4:], "96x54")
+    assert "wide as high" in refused(
+        command_line, tmp_path, *ask[:2], "--panorama", *ask[4:], "96x54"
+    )
 
 
 def test_a_shape_keeps_pixels_square_and_all_in_frame() -> None:
@@ -78,11 +92,15 @@ def test_an_mp4_without_ffmpeg_says_so(
 ) -> None:
     monkeypatch.setenv("PATH", "")
     write_splats(tmp_path / "ball.ply", checkered_ball(100))
-    told = refused(command_line, tmp_path, "render", "ball.ply", "--orbit", 2, "-o", "a.mp4", status=1)
+    told = refused(
+        command_line, tmp_path, "render", "ball.ply", "--orbit", 2, "-o", "a.mp4", status=1
+    )
     assert "ffmpeg" in told
 
 
-def test_compare_prints_scores_and_opens_at_a_typical_view(tmp_path: Path, command_line: CommandLine) -> None:
+def test_compare_prints_scores_and_opens_at_a_typical_view(
+    tmp_path: Path, command_line: CommandLine
+) -> None:
     ball = checkered_ball(800)
     write_splats(tmp_path / "a.ply", ball)
     write_splats(tmp_path / "b.ply", ball.take(np.arange(800) % 2 == 0))
@@ -96,7 +114,9 @@ def test_compare_prints_scores_and_opens_at_a_typical_view(tmp_path: Path, comma
     titles = re.findall(r'"title": "([^"]+)"', page)
     worst = sorted(found["views"], key=lambda view: view["psnr"])[:3]
     assert [title.split(":")[0] for title in titles] == ["typical", "worst 1", "worst 2", "worst 3"]
-    assert titles[1:] == [f"worst {i}: {v['name']}, {v['psnr']:.1f} dB" for i, v in enumerate(worst, 1)]
+    assert titles[1:] == [
+        f"worst {i}: {v['name']}, {v['psnr']:.1f} dB" for i, v in enumerate(worst, 1)
+    ]
     assert worst[0]["name"] not in titles[0]
     assert "worst: " in succeeds(command_line, tmp_path, *ask).out
     same = json.loads(

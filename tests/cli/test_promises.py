@@ -56,7 +56,10 @@ DEFAULTS: dict[str, str] = {
     **{
         f"{command} schedule": (
             "at least {:.0f}, {:.0f} or {:,.0f} steps".format(
-                *(SCHEDULES[name].for_renders * SCHEDULES[name].steps for name in ("fast", "default", "best"))
+                *(
+                    SCHEDULES[name].for_renders * SCHEDULES[name].steps
+                    for name in ("fast", "default", "best")
+                )
             )
         )
         for command in ("distill", "recover")
@@ -91,7 +94,10 @@ CALLS: dict[str, tuple[str, str]] = {
         f"{command} fit": (" ".join(["5MB", *DEVICES]), f"{command} ball.ply --fit {{}} --dry-run")
         for command in ("distill", "simplify")
     },
-    "distill schedule": ("fast default best paper", "distill ball.ply -r 8 --schedule {} --dry-run"),
+    "distill schedule": (
+        "fast default best paper",
+        "distill ball.ply -r 8 --schedule {} --dry-run",
+    ),
     "distill time": (TIMES, "distill ball.ply -r 8 --time {} --dry-run"),
     "distill recovery_time": (TIMES, "distill ball.ply -r 8 --recovery-time {} --dry-run"),
     "recover recovery_time": (
@@ -123,7 +129,10 @@ CALLS: dict[str, tuple[str, str]] = {
         ".ply .compressed.ply .sog .spz .glb .splat .usda .usdc meta.json .csv",
         "convert ball.ply -o {}",
     ),
-    "convert where": ("'opacity > 0.05 and largest_scale < 2'", "convert ball.ply out.ply --where {}"),
+    "convert where": (
+        "'opacity > 0.05 and largest_scale < 2'",
+        "convert ball.ply out.ply --where {}",
+    ),
     "convert from_axes": ("RDF", "convert ball.ply out.ply --from-axes {}"),
     "convert to_axes": ("y-up z-up RFU", "convert ball.ply out.ply --to-axes {}"),
     "clean only": (" ".join([*KINDS, "none"]), "clean sky.ply --only {} -o out.ply"),
@@ -250,9 +259,13 @@ def test_several_budgets_are_taken_where_help_says_so(
 ) -> None:
     folder = shutil.copytree(inputs, tmp_path / "inputs")
     flag = {"count": "-n", "ratio": "-r"}[option]
-    several = re.search(r"Several \((.*?)\) need (\{\w+\}) in (--\w+)", helps()[f"{command} {option}"])
+    several = re.search(
+        r"Several \((.*?)\) need (\{\w+\}) in (--\w+)", helps()[f"{command} {option}"]
+    )
     if several is None:
-        assert "one budget" in refused(command_line, folder, command, "ball.ply", flag, "5,10", "-o", "out")
+        assert "one budget" in refused(
+            command_line, folder, command, "ball.ply", flag, "5,10", "-o", "out"
+        )
         return
     values, pattern, output = several.groups()
     small = values.replace("k", "")  # the ball has no 10,000
@@ -286,7 +299,8 @@ LOOKS_LIKE = re.compile(r"default|such as|\{\w+\}|(?<![\w.])\.[a-z]\w+|\d")
 def test_every_promise_is_tried() -> None:
     left, texts = {}, helps()
     for text in dict.fromkeys(texts.values()):
-        options = [option for option, found in texts.items() if found == text]  # commands share them
+        # commands share them
+        options = [option for option, found in texts.items() if found == text]
         rest = re.sub(r"Several \(.*", "", text.replace("g2ard", ""))  # the test above
         for told in filter(None, map(DEFAULTS.get, options)):
             rest = rest.replace(told, "")

@@ -22,10 +22,16 @@ USAGE = [
     ("render x.ply --views v.json -o out --threads -1", "--threads"),
     ("render x.ply --views v.json -o out --background 2,0,0", "--background"),
     ("render x.ply --views v.json -o out --device abacus", "abacus"),
-    ("render ball.ply -k 4 --views views.json --sheet a.png", "-k generates views, so it excludes --views"),
+    (
+        "render ball.ply -k 4 --views views.json --sheet a.png",
+        "-k generates views, so it excludes --views",
+    ),
     ("render ball.ply --orbit 2 -k 3 -o a", "--orbit"),
     ("render ball.ply -k 1 -o ball.ply", "name another output"),
-    ("render ball.ply -k 1 -o turn.avi", "expected a folder, .png, .gif, .webp or .mp4, got 'turn.avi'"),
+    (
+        "render ball.ply -k 1 -o turn.avi",
+        "expected a folder, .png, .gif, .webp or .mp4, got 'turn.avi'",
+    ),
     ("render ball.ply -k 2 -o two.png", "-o: two.png holds one view, not 2; give -k 1 or a folder"),
     ("render ball.ply -o x --sheet a.jpg", "ends in .png, got 'a.jpg'"),
     ("clean ball.ply --dry-run --preview a.jpg", "ends in .png, got 'a.jpg'"),
@@ -36,19 +42,34 @@ USAGE = [
     ("simplify ball.ply -n 5 -o o.ply --up 0,0,0", "a direction such as 0,0,1"),
     ("simplify ball.ply -r 2 -o o.ply --views v --no-views", "; give one"),
     ("simplify ball.ply -r 2 -o o.ply --json o.ply", "is written by --json too"),
-    ("simplify ball.ply -r 4 -o {foo}_{ratio}.ply", "unknown placeholder {foo}; use {ratio} or {count}"),
+    (
+        "simplify ball.ply -r 4 -o {foo}_{ratio}.ply",
+        "unknown placeholder {foo}; use {ratio} or {count}",
+    ),
     (
         "simplify ball.ply -n 200,100 -o s.ply",
         "such as s_{count}.ply; commas separate counts, so write a single one as 10_000",
     ),
-    ("recover ball.ply --views made -o o.ply", "generated views have no photos; give --teacher SCENE"),
+    (
+        "recover ball.ply --views made -o o.ply",
+        "generated views have no photos; give --teacher SCENE",
+    ),
     ("recover ball.ply -o o.ply --steps 3 --recovery-time 9", "; give one"),
-    ("recover ball.ply -o o.ply --engine gsplat", "expected one of fused, torch (the device gpu runs fused"),
+    (
+        "recover ball.ply -o o.ply --engine gsplat",
+        "expected one of fused, torch (the device gpu runs fused",
+    ),
     ("recover ball.ply -o o.ply --device cuda", "--device: expected auto, cpu or gpu, got 'cuda'"),
-    ("select absent.ply --views v -k 3 -o out --policy random", "expected one of auto, directional, got"),
+    (
+        "select absent.ply --views v -k 3 -o out --policy random",
+        "expected one of auto, directional, got",
+    ),
     ("distill --views views.json --renders -n 9 -o run", "--renders needs a SCENE to render"),
     ("distill ball.ply -n 5 -o run --held-out made", "--held-out must be a file of views"),
-    ("distill ball.ply -n 5 -o run --views made --photos", "--photos: generated views have no photos"),
+    (
+        "distill ball.ply -n 5 -o run --views made --photos",
+        "--photos: generated views have no photos",
+    ),
     (
         "distill ball.ply -n 5 -o run --steps 5 --set schedule.steps=9",
         "--steps and --set recover.schedule.steps exclude each other",
@@ -73,8 +94,14 @@ USAGE = [
     ("simplify ball.ply -n 5 -o o.ply --config ball.ply", "ball.ply: not a text file"),
     ("simplify ball.ply -n 5 -o o.ply --keep-region 0,0,1", "expected X,Y,Z,R or X,Y,Z,X,Y,Z"),
     ("simplify ball.ply -n 5 -o o.ply --keep-region 0,0,0,-1", "expected a radius > 0"),
-    ("simplify ball.ply -n 5 -o o.ply --keep-region 0,0,0,1 --no-views", "--keep-region needs views"),
-    ("simplify ball.ply -n 5 -o o.ply --keep-region 0,0,0,1 --method paper", "--keep-region: has no effect"),
+    (
+        "simplify ball.ply -n 5 -o o.ply --keep-region 0,0,0,1 --no-views",
+        "--keep-region needs views",
+    ),
+    (
+        "simplify ball.ply -n 5 -o o.ply --keep-region 0,0,0,1 --method paper",
+        "--keep-region: has no effect",
+    ),
     ("lod ball.ply -o x -r 2,1", "--ratios: expected rising numbers of at least 1"),
     ("lod ball.ply -o x --chunk-extent inf", "--chunk-extent: expected a finite number above 0"),
     (
@@ -112,9 +139,18 @@ INPUT = [
     ("distill absent.ply -r 10 -o run", "absent.ply"),
     ("distill absent.ply -n 9 --format SOG -o run", "absent.ply: no such file"),
     ("distill ball.ply -n 401 -o run", "401"),
-    ("distill ball.ply -n 9 -o run --set lift.spread=2", "lift.spread: has no effect on a trained scene"),
-    ("distill ball.ply -n 9 -o run --set lift.spread=2 --tile-rows 150", "lift.spread: has no effect"),
-    ("simplify ball.ply -n 5 -o o.ply --keep-region 0,0,90,1", "contains none of the 400 Gaussians"),
+    (
+        "distill ball.ply -n 9 -o run --set lift.spread=2",
+        "lift.spread: has no effect on a trained scene",
+    ),
+    (
+        "distill ball.ply -n 9 -o run --set lift.spread=2 --tile-rows 150",
+        "lift.spread: has no effect",
+    ),
+    (
+        "simplify ball.ply -n 5 -o o.ply --keep-region 0,0,90,1",
+        "contains none of the 400 Gaussians",
+    ),
     ("distill ball.ply -r 2 -o run --views none.json", "none.json"),
     ("distill ball.ply -r 2 -o ball.ply/run", "ball.ply is a file"),
     ("distill ball.ply -r 2 -o run --json ball.ply/where.json", "where.json"),

@@ -40,7 +40,9 @@ def folder(tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize(("command", "left"), LEFT)
-def test_checkpoints_are_kept(folder: Path, command_line: CommandLine, command: str, left: str) -> None:
+def test_checkpoints_are_kept(
+    folder: Path, command_line: CommandLine, command: str, left: str
+) -> None:
     teacher = () if command.startswith("distill") else ("--teacher", "t.ply")
     ask = (*command.split(), "--views", "views.json", *teacher)
     place = folder / left
@@ -83,7 +85,10 @@ def test_a_file_that_is_not_a_checkpoint_is_named(tmp_path: Path, content: bytes
 
 @pytest.mark.parametrize("options", [("--set", "select.views_count=2"), ("--views", "v.json")])
 def test_a_recovered_run_renders_only_views_that_are_scored(
-    folder: Path, command_line: CommandLine, monkeypatch: pytest.MonkeyPatch, options: tuple[str, ...]
+    folder: Path,
+    command_line: CommandLine,
+    monkeypatch: pytest.MonkeyPatch,
+    options: tuple[str, ...],
 ) -> None:
     rendered: list[str] = []
     make, score = TeacherRenders._make, scoring.describe_run
@@ -108,9 +113,12 @@ def test_a_recovered_run_renders_only_views_that_are_scored(
     report = json.loads((folder / "run" / "report.json").read_text())
     scores = (report["scores"], report["apart"] or report["scores"])
     scored = {view["name"] for part in scores for view in part["recovered"]["views"]}
-    assert set(rendered) - {"view_0000", "view_0001", "view_0002"} == scored  # and those of preview.png
+    # and those of preview.png
+    assert set(rendered) - {"view_0000", "view_0001", "view_0002"} == scored
     assert scored < every
-    assert (folder / "run" / "scene.ply").read_bytes() == (folder / "whole" / "scene.ply").read_bytes()
+    assert (folder / "run" / "scene.ply").read_bytes() == (
+        folder / "whole" / "scene.ply"
+    ).read_bytes()
 
 
 def test_the_total_of_a_resumed_run_holds_what_was_done_before(
@@ -120,11 +128,25 @@ def test_the_total_of_a_resumed_run_holds_what_was_done_before(
 
     def resumed(self: DistillJob, *given: Any, **named: Any) -> Distilled:
         done = real(self, *given, **named)
-        seconds = replace(done.report.seconds, recover=done.report.seconds.recover + 50, resumed=50.0)
+        seconds = replace(
+            done.report.seconds, recover=done.report.seconds.recover + 50, resumed=50.0
+        )
         return replace(done, report=replace(done.report, seconds=seconds))
 
     monkeypatch.setattr(DistillJob, "run", resumed)
-    ask = ("distill", "a.ply", "-r", 2, "--views", "views.json", "--steps", 2, "--focus", "far", "--no-page")
+    ask = (
+        "distill",
+        "a.ply",
+        "-r",
+        2,
+        "--views",
+        "views.json",
+        "--steps",
+        2,
+        "--focus",
+        "far",
+        "--no-page",
+    )
     ask = (*ask, "-o", "run", "--json", "-")
     out, error = succeeds(command_line, folder, *ask)
     seconds = json.loads(out)["seconds"]
@@ -132,10 +154,19 @@ def test_the_total_of_a_resumed_run_holds_what_was_done_before(
     stages = {name: value for name, value in seconds.items() if name not in ("resumed", "total")}
     assert seconds["total"] == pytest.approx(sum(stages.values()))
     assert min(stages.values()) >= 0
-    told = ", ".join(f"{name} {value:.1f} s" for name, value in seconds.items() if name != "resumed")
+    told = ", ".join(
+        f"{name} {value:.1f} s" for name, value in seconds.items() if name != "resumed"
+    )
     assert f"; {told}" in " ".join((out + error).split())
 
 
-def test_a_resumed_command_that_kept_nothing_says_so(command_line: CommandLine, folder: Path) -> None:
-    words = "recover a.ply --views views.json --teacher t.ply --steps 2 --size 24 -o new.ply --resume"
-    assert "new.ply: nothing to resume, starting over" in succeeds(command_line, folder, *words.split()).err
+def test_a_resumed_command_that_kept_nothing_says_so(
+    command_line: CommandLine, folder: Path
+) -> None:
+    words = (
+        "recover a.ply --views views.json --teacher t.ply --steps 2 --size 24 -o new.ply --resume"
+    )
+    assert (
+        "new.ply: nothing to resume, starting over"
+        in succeeds(command_line, folder, *words.split()).err
+    )

@@ -40,7 +40,9 @@ def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
         "distill runs/a -r 2 --size 48 --steps 2 --focus far --no-page -o {}/again",
     ],
 )
-def test_commands_read_runs(ask: str, home: Path, tmp_path: Path, command_line: CommandLine) -> None:
+def test_commands_read_runs(
+    ask: str, home: Path, tmp_path: Path, command_line: CommandLine
+) -> None:
     succeeds(command_line, home, *ask.format(tmp_path).split())
 
 
@@ -53,10 +55,29 @@ def test_python_reads_them_too(home: Path) -> None:
 def test_the_views_of_the_table_can_be_scored_again(
     home: Path, tmp_path: Path, command_line: CommandLine
 ) -> None:
-    ask = ("distill", "ball.ply", "-r", 4, "--steps", 2, "--size", 48, "--no-page", "-o", tmp_path / "run")
+    ask = (
+        "distill",
+        "ball.ply",
+        "-r",
+        4,
+        "--steps",
+        2,
+        "--size",
+        48,
+        "--no-page",
+        "-o",
+        tmp_path / "run",
+    )
     succeeds(command_line, home, *ask)
     report = json.loads((tmp_path / "run" / "report.json").read_text())
-    again = ("evaluate", tmp_path / "run", "--teacher", "ball.ply", "--views", tmp_path / "run/scored.json")
+    again = (
+        "evaluate",
+        tmp_path / "run",
+        "--teacher",
+        "ball.ply",
+        "--views",
+        tmp_path / "run/scored.json",
+    )
     out = succeeds(command_line, home, *again, "--json", "-").out
     scored = {view["name"]: view["psnr"] for view in json.loads(out)["scenes"][0]["views"]}
     views = [*report["scores"]["recovered"]["views"], *report["apart"]["recovered"]["views"]]
@@ -70,11 +91,15 @@ def test_the_size_is_the_scene_files(home: Path, command_line: CommandLine) -> N
 
 
 def test_a_folder_of_runs_names_them(home: Path) -> None:
-    with pytest.raises(InputError, match=r"runs: is not a supported folder; give one of its runs: a, b$"):
+    with pytest.raises(
+        InputError, match=r"runs: is not a supported folder; give one of its runs: a, b$"
+    ):
         g2ard.load(home / "runs")
 
 
-def test_scenes_are_checked_before_poses_are_made_for_them(home: Path, command_line: CommandLine) -> None:
+def test_scenes_are_checked_before_poses_are_made_for_them(
+    home: Path, command_line: CommandLine
+) -> None:
     ask = ("evaluate", "runs/a", "gone.ply", "--teacher", "ball.ply", "--size", 48)
     status, _, error = command_line(*ask, cwd=home)
     assert (status, error) == (1, "g2ard: gone.ply: no such file or folder\n")

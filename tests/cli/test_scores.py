@@ -123,7 +123,9 @@ def test_two_worlds_are_refused(
 
 
 @pytest.mark.parametrize("case", ["other photos", "moved"])
-def test_photos_of_two_worlds_are_refused(tmp_path: Path, command_line: CommandLine, case: str) -> None:
+def test_photos_of_two_worlds_are_refused(
+    tmp_path: Path, command_line: CommandLine, case: str
+) -> None:
     first, second = tmp_path / "a", tmp_path / "b"
     first.mkdir()
     second.mkdir()
@@ -138,10 +140,15 @@ def test_photos_of_two_worlds_are_refused(tmp_path: Path, command_line: CommandL
     assert "two" in error
 
 
-def test_compare_says_which_run_is_closer_to_their_scene(runs: Path, command_line: CommandLine) -> None:
+def test_compare_says_which_run_is_closer_to_their_scene(
+    runs: Path, command_line: CommandLine
+) -> None:
     ask = ("compare", "-k", 2, "--size", 32)
     for order in (("worse", "better"), ("better", "worse")):
-        assert "against ball.ply, better is better: +" in succeeds(command_line, runs, *ask, *order).err
+        assert (
+            "against ball.ply, better is better: +"
+            in succeeds(command_line, runs, *ask, *order).err
+        )
     g2ard.save("plain.ply", BALL.take(range(100)))
     for order in (("plain.ply", "better"), ("better", "plain.ply")):
         assert "g2ard evaluate" in succeeds(command_line, runs, *ask, *order).err
@@ -151,9 +158,22 @@ def test_compare_says_which_run_is_closer_to_their_scene(runs: Path, command_lin
 
 def test_every_score_has_its_size(runs: Path, command_line: CommandLine) -> None:
     g2ard.save_views("photos.json", photographed(runs / "better", BALL, around(8, (64, 48))))
-    ask = ("distill", "ball.ply", "-n", 40, "--views", "photos.json", "--photos", "--steps", 2, "--no-page")
+    ask = (
+        "distill",
+        "ball.ply",
+        "-n",
+        40,
+        "--views",
+        "photos.json",
+        "--photos",
+        "--steps",
+        2,
+        "--no-page",
+    )
     printed = succeeds(command_line, runs, *ask, "--size", 32, "-o", "run", "--format", "sog").err
-    scored = [line for line in printed.splitlines() if "dB" in line or "held-out views against" in line]
+    scored = [
+        line for line in printed.splitlines() if "dB" in line or "held-out views against" in line
+    ]
     assert any("1 photo, 64×48 px" in line for line in scored)  # the views' own size
     assert sum("32×24 px" in line for line in scored) == 2  # the table, and the file
     report = json.loads((runs / "run" / "report.json").read_text())
@@ -186,7 +206,9 @@ def test_a_size_that_harms_is_a_warning_with_the_way_out() -> None:
     for own, warned in ((harmed, True), (usual, False)):
         own_size = {"simplified": before, "recovered": own}
         scores = {"recovered": at_size}
-        report: Any = SimpleNamespace(rounds=[], kinds=[], own_size=own_size, scores=scores, **fields)
+        report: Any = SimpleNamespace(
+            rounds=[], kinds=[], own_size=own_size, scores=scores, **fields
+        )
         warnings = [line for line in list_remarks(report) if line.startswith("warning: ")]
         assert bool(warnings) == warned
         assert all("7.5 dB" in line and "leave --size out" in line for line in warnings)
@@ -194,7 +216,18 @@ def test_a_size_that_harms_is_a_warning_with_the_way_out() -> None:
 
 def test_no_second_score_without_a_size(runs: Path, command_line: CommandLine) -> None:
     g2ard.save_views("photos.json", photographed(runs / "better", BALL, around(8, (64, 48))))
-    ask = ("distill", "ball.ply", "-n", 40, "--views", "photos.json", "--photos", "--steps", 2, "--no-page")
+    ask = (
+        "distill",
+        "ball.ply",
+        "-n",
+        40,
+        "--views",
+        "photos.json",
+        "--photos",
+        "--steps",
+        2,
+        "--no-page",
+    )
     assert "own size" not in succeeds(command_line, runs, *ask, "--size", 64, "-o", "run").err
 
 
@@ -225,7 +258,18 @@ def test_only_some_large_views_are_scored_at_their_own_size(
 ) -> None:
     monkeypatch.setattr("g2ard.jobs.run_views.FULL_PIXELS", 3 * 64 * 48)
     g2ard.save_views("views.json", around(8, (64, 48)))
-    ask = ("evaluate", "better/scene.ply", "--teacher", "ball.ply", "--views", "views.json", "--split", "all")
-    (row,) = json.loads(succeeds(command_line, runs, *ask, "--size", 32, "--json", "-").out)["scenes"]
+    ask = (
+        "evaluate",
+        "better/scene.ply",
+        "--teacher",
+        "ball.ply",
+        "--views",
+        "views.json",
+        "--split",
+        "all",
+    )
+    (row,) = json.loads(succeeds(command_line, runs, *ask, "--size", 32, "--json", "-").out)[
+        "scenes"
+    ]
     assert row["own_size"]["scored_in"].startswith("3 views")
     assert row["scored_in"].startswith("8 views")

@@ -21,7 +21,8 @@ def test_a_finished_run_is_not_taken_for_another(command_line: CommandLine, fold
     begin = (*SHORT, "-o", "run")
     ask = (*begin, "-r", 10)
     out = succeeds(command_line, folder, *ask, "--json", "-").out
-    (folder / "ball.ply").rename(folder / "away.ply")  # what is refused is refused before the scene is read
+    # what is refused is refused before the scene is read
+    (folder / "ball.ply").rename(folder / "away.ply")
     again = succeeds(command_line, folder, *ask, "--resume", "--json", "-").out
     ran, told = json.loads(out), json.loads(again)
     assert told["scores"] == ran["scores"]
@@ -31,17 +32,22 @@ def test_a_finished_run_is_not_taken_for_another(command_line: CommandLine, fold
         ((*begin, "-r", 5), "budget"),
     )
     for other, words in others:
-        assert f"run: finished with other options ({words}); -w without --resume starts over" in refused(
-            command_line, folder, *other, "--resume", status=1
+        assert (
+            f"run: finished with other options ({words}); -w without --resume starts over"
+            in refused(command_line, folder, *other, "--resume", status=1)
         )
     (folder / "away.ply").rename(folder / "ball.ply")
     assert command_line(*SHORT, "-o", "run", "-n", 40, "--resume", cwd=folder)[0] == 0
     (folder / "run" / "report.json").unlink()
-    assert "run: exists; -w (--overwrite)" in refused(command_line, folder, *ask, "--resume", status=1)
+    assert "run: exists; -w (--overwrite)" in refused(
+        command_line, folder, *ask, "--resume", status=1
+    )
 
 
 @needs_signals
-def test_a_stopped_run_continues_with_other_options(command_line: CommandLine, folder: Path) -> None:
+def test_a_stopped_run_continues_with_other_options(
+    command_line: CommandLine, folder: Path
+) -> None:
     ask = ("distill", "ball.ply", "-r", 4, "-o", "run", "--size", 48)
     running = program(*ask, "--steps", 100_000, folder=folder, stderr=subprocess.PIPE)
     work = interrupt_at_checkpoint(running, folder)
@@ -52,8 +58,14 @@ def test_a_stopped_run_continues_with_other_options(command_line: CommandLine, f
     for words in ("stopped run", "simplified-1", "400 → 100", "ball.ply", "with --resume (-o run)"):
         assert words in out
     assert json.loads(command_line("info", "run", "--json", "-", cwd=folder)[1])["kept"]
-    assert "run: continues after " in succeeds(command_line, folder, *ask, "--steps", 7, "--resume").err
-    assert json.loads((folder / "run" / "report.json").read_text())["rounds"][0]["recover"][0]["steps"] == 7
+    assert (
+        "run: continues after "
+        in succeeds(command_line, folder, *ask, "--steps", 7, "--resume").err
+    )
+    assert (
+        json.loads((folder / "run" / "report.json").read_text())["rounds"][0]["recover"][0]["steps"]
+        == 7
+    )
     assert not work.exists()
 
 

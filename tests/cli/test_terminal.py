@@ -54,7 +54,11 @@ DRAWN = {
 }
 """Stages whose bars commands draw."""
 TO_STDOUT = ("evaluate", "compare", "info")
-KINDS: list[tuple[int, dict[str, str]]] = [(200, {}), (40, {"NO_COLOR": "1"}), (80, {"TERM": "dumb"})]
+KINDS: list[tuple[int, dict[str, str]]] = [
+    (200, {}),
+    (40, {"NO_COLOR": "1"}),
+    (80, {"TERM": "dumb"}),
+]
 ENDLESS = {
     "distill": ("recover", "--steps 100000"),
     "recover": ("recover", "--steps 100000"),
@@ -159,7 +163,9 @@ def test_any_terminal_ends_with_the_messages_of_a_pipe(
         assert screen.status == 0, screen.received
         assert_tidy(screen)
         if "NO_COLOR" in variables:
-            assert not re.search(r"\x1b\[[\d;]*3\dm", screen.received), "colours in spite of NO_COLOR"
+            assert not re.search(r"\x1b\[[\d;]*3\dm", screen.received), (
+                "colours in spite of NO_COLOR"
+            )
         elif variables.get("TERM") == "dumb":
             assert "\x1b" not in screen.received
         elif command in DRAWN:
@@ -179,7 +185,9 @@ def test_results_on_the_terminal_itself(
     command: str, columns: int, shown: Callable[..., Screen], tmp_path: Path
 ) -> None:
     """Figures are whole, also where a terminal has no room for their table."""
-    screen = shown(command, *["--json", "found.json"] * (command != "info"), columns=columns, piped=False)
+    screen = shown(
+        command, *["--json", "found.json"] * (command != "info"), columns=columns, piped=False
+    )
     assert screen.status == 0, screen.received
     assert_tidy(screen)
     assert screen.lines[-1]

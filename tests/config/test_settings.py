@@ -38,7 +38,14 @@ class Outer:
 
 
 def test_a_field_of_any_dataclass_is_a_setting_at_once() -> None:
-    texts = ["outer.cells=7", "edges=0.5,4", "exact=true", "mode=hard", "inner.brand_new=1e-3", "cells=none"]
+    texts = [
+        "outer.cells=7",
+        "edges=0.5,4",
+        "exact=true",
+        "mode=hard",
+        "inner.brand_new=1e-3",
+        "cells=none",
+    ]
     values = parse_settings(texts, Outer())
     assert changed(Outer(cells=3), values) == Outer(None, "hard", True, Inner(1e-3, (0.5, 4.0)))
     assert changed(Inner(), values) == Inner()

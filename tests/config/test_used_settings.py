@@ -162,7 +162,9 @@ SELECT: dict[str, Any] = {
 
 def _simplified(method: str, **how: Any) -> Callable[[Mapping[str, Any]], object]:
     def run(settings: Mapping[str, Any]) -> object:
-        return g2ard.simplify(SCENE, count=80, method=method, settings=settings, **how).splats.fingerprint()
+        return g2ard.simplify(
+            SCENE, count=80, method=method, settings=settings, **how
+        ).splats.fingerprint()
 
     return run
 
@@ -188,7 +190,9 @@ def _lifted(settings: Mapping[str, Any]) -> object:
 
 
 def _adapted(settings: Mapping[str, Any]) -> object:
-    config = configure(g2ard.AdaptConfig(), settings={f"adapt.{name}": v for name, v in settings.items()})
+    config = configure(
+        g2ard.AdaptConfig(), settings={f"adapt.{name}": v for name, v in settings.items()}
+    )
     return g2ard.adapt(SMALL, TARGETS, config).splats.fingerprint()
 
 
@@ -220,10 +224,21 @@ DISTILL: dict[str, Any] = {
     "select.focus": "near",
     "select.focus_share": 0.25,
 }
-HANDED_ON = {"simplify.fold", "recover.ssim_weight", "recover.regularizers.anchor", "recover.schedule.reach"}
-FEW = {name: value for name, value in DISTILL.items() if name.startswith("select.") or name in HANDED_ON}
+HANDED_ON = {
+    "simplify.fold",
+    "recover.ssim_weight",
+    "recover.regularizers.anchor",
+    "recover.schedule.reach",
+}
+FEW = {
+    name: value
+    for name, value in DISTILL.items()
+    if name.startswith("select.") or name in HANDED_ON
+}
 """Settings that a whole distillation is tried with: stages get theirs as one object, so few tell for all."""
-_REACHING_TILES = "simplify.fold recover.background recover.sh_degree select.policy select.views_count"
+_REACHING_TILES = (
+    "simplify.fold recover.background recover.sh_degree select.policy select.views_count"
+)
 IN_TILES = {name: DISTILL[name] for name in _REACHING_TILES.split()}
 """Settings that a distillation in tiles is tried with: one of each stage, and what its targets depend on."""
 _OF_TILES = "retention fold min_opacity morton_premerge_ratio dilation keep_region protection"
@@ -238,7 +253,9 @@ FAR = {"select.focus": "far"}  # plans no views of other kinds to train on, whic
 
 def _distilled(settings: Mapping[str, Any]) -> object:
     settings = {**FAR, **settings}
-    return g2ard.distill(SCENE, count=BUDGET, views=UNEVEN, size=48, settings=settings).splats.fingerprint()
+    return g2ard.distill(
+        SCENE, count=BUDGET, views=UNEVEN, size=48, settings=settings
+    ).splats.fingerprint()
 
 
 @cache
@@ -266,7 +283,10 @@ def _distilled_in_tiles(settings: Mapping[str, Any]) -> object:
 PRIORS = ("trained", "lift")  # noisy has the terms of lift
 RUNS: dict[str, tuple[Callable[[Mapping[str, Any]], object], dict[str, Any]]] = {
     **{method: (_simplified(method, views=VIEWS), SIMPLIFY) for method in ("default", "fast")},
-    **{f"{method} blind": (_simplified(method, blind=True), SIMPLIFY) for method in ("default", "fast")},
+    **{
+        f"{method} blind": (_simplified(method, blind=True), SIMPLIFY)
+        for method in ("default", "fast")
+    },
     "paper": (_simplified("paper"), SIMPLIFY),
     "default in tiles": (_simplified_in_tiles, OF_TILES),
     **{f"recover {kind}": (_recovered, RECOVER) for kind in PRIORS},
@@ -286,7 +306,11 @@ RECOVERY_BESIDE: dict[str, dict[str, Any]] = {
 }
 BESIDE: dict[str, dict[str, Any]] = {
     **{f"recover {kind}": {**RECOVERY, "regularizers": kind} for kind in PRIORS},
-    **{f"recover {kind}: {name}": beside for kind in PRIORS for name, beside in RECOVERY_BESIDE.items()},
+    **{
+        f"recover {kind}: {name}": beside
+        for kind in PRIORS
+        for name, beside in RECOVERY_BESIDE.items()
+    },
     "adapt": {"steps": 6, "first_stretch": 2, "tolerance": 0.0, "colour_worth": 0.0},
     "adapt paper": {"steps": 6, "schedule": "paper"},
     "adapt paper: schedule": {"schedule": "default"},
@@ -298,7 +322,10 @@ BESIDE: dict[str, dict[str, Any]] = {
         for of, beside in {
             "": {**RECOVERY, "regularizers": "trained", "schedule.guarded": False},
             **{f": recover.{name}": beside for name, beside in RECOVERY_BESIDE.items()},
-            ": recover.schedule.guarded": {**RECOVERY_BESIDE["schedule.guarded"], "schedule.guarded": True},
+            ": recover.schedule.guarded": {
+                **RECOVERY_BESIDE["schedule.guarded"],
+                "schedule.guarded": True,
+            },
         }.items()
     },
     "paper: max_energy": {"color_bin": 1.0},
@@ -349,9 +376,7 @@ def test_values_of_a_preset_may_have_no_effect() -> None:
         configure(g2ard.SimplifyConfig(), "paper", {"method": "fast", "fold": 0.5})
 
 
-_BESIDES = (
-    "method engine matcher schedule.steps schedule.for_renders schedule.round_steps schedule.means_in_scales"
-)
+_BESIDES = "method engine matcher schedule.steps schedule.for_renders schedule.round_steps schedule.means_in_scales"
 """Settings that choose a run, or that only its schedule sets."""
 
 
@@ -367,8 +392,11 @@ def test_the_tables_hold_every_setting() -> None:
         ("", (g2ard.DistillConfig(), paper), DISTILL),
     ):
         besides = tuple(f".{name}" for name in _BESIDES.split())
-        named = {path for config in configs for path in values_of(config) if not path.endswith(besides)}
-        named = {re.sub(r"^adapt.recovery\..*", "adapt.recovery", path) for path in named}  # set as a whole
+        named = {
+            path for config in configs for path in values_of(config) if not path.endswith(besides)
+        }
+        # set as a whole
+        named = {re.sub(r"^adapt.recovery\..*", "adapt.recovery", path) for path in named}
         named = {f"{root}{path.partition('.')[2]}" for path in named} if root else named
         assert named == {f"{root}{name}" for name in table}
 
@@ -376,7 +404,9 @@ def test_the_tables_hold_every_setting() -> None:
 @pytest.mark.parametrize("root", [g2ard.SimplifyConfig, g2ard.SelectConfig])
 def test_a_variant_has_only_its_own_settings(root: Any) -> None:
     tag, path = root._tag, root.__name__.removesuffix("Config").lower()
-    every = {name: value for kind in root._variants.values() for name, value in vars(kind()).items()}
+    every = {
+        name: value for kind in root._variants.values() for name, value in vars(kind()).items()
+    }
     for variant in root._variants:
         own = root(variant)
         for name in every.keys() - vars(own).keys():
@@ -411,7 +441,12 @@ def test_recover_measures_which_weights_suit_the_scene() -> None:
     ball = checkered_ball(900)
     discs = g2ard.lift(ball.means, np.clip(0.5 + SH_C0 * ball.sh0[:, 0], 0, 1))
     small = g2ard.simplify(discs, count=60, blind=True).splats
-    given: dict[str, Any] = {"teacher": discs, "views": VIEWS, "steps": 6, "settings": {"period": 1}}
+    given: dict[str, Any] = {
+        "teacher": discs,
+        "views": VIEWS,
+        "steps": 6,
+        "settings": {"period": 1},
+    }
     lift, trained, measured = (
         g2ard.recover(small, **given, regularizers=kind).splats.fingerprint()
         for kind in ("lift", "trained", None)

@@ -26,7 +26,13 @@ from PIL import Image
 _NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
 _PLAYWRIGHT = ("chromium*/chrome-linux*/chrome", "chromium*/chrome-linux*/headless_shell")
 _FLAGS = [
-    *("--headless=new", "--no-sandbox", "--remote-debugging-pipe", "--no-first-run", "--mute-audio"),
+    *(
+        "--headless=new",
+        "--no-sandbox",
+        "--remote-debugging-pipe",
+        "--no-first-run",
+        "--mute-audio",
+    ),
     *("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"),
     *(
         "--disable-dev-shm-usage",
@@ -41,10 +47,14 @@ _SECONDS = 240
 def chromium() -> str:
     """Return the browser's path; skip the test if none is installed."""
     if sys.platform == "win32":
-        pytest.skip("the browser is spoken to by file descriptors 3 and 4, which Windows does not pass on")
+        pytest.skip(
+            "the browser is spoken to by file descriptors 3 and 4, which Windows does not pass on"
+        )
     given = os.environ.get("G2ARD_CHROMIUM")
     found = [given] if given else [shutil.which(name) for name in _NAMES]
-    cache = Path(os.environ.get("PLAYWRIGHT_BROWSERS_PATH", Path.home() / ".cache" / "ms-playwright"))
+    cache = Path(
+        os.environ.get("PLAYWRIGHT_BROWSERS_PATH", Path.home() / ".cache" / "ms-playwright")
+    )
     found += [str(path) for pattern in _PLAYWRIGHT for path in sorted(cache.glob(pattern))]
     path = next((name for name in found if name and Path(name).is_file()), None)
     if path is None:
@@ -119,7 +129,9 @@ class Browser:
         self._context = self.send("Target.createBrowserContext")["browserContextId"]
         where = {"browserContextId": self._context, "width": width, "height": height}
         target = self.send("Target.createTarget", url="about:blank", **where)["targetId"]
-        self._session = self.send("Target.attachToTarget", targetId=target, flatten=True)["sessionId"]
+        self._session = self.send("Target.attachToTarget", targetId=target, flatten=True)[
+            "sessionId"
+        ]
         for domain in ("Page", "Runtime", "Network"):
             self.send(f"{domain}.enable")
         self.send("Emulation.setFocusEmulationEnabled", enabled=True)
@@ -153,7 +165,9 @@ class Browser:
 
     def run(self, expression: str) -> Any:
         """Return the awaited value of a JavaScript expression; fail with the exception it throws."""
-        done = self.send("Runtime.evaluate", expression=expression, awaitPromise=True, returnByValue=True)
+        done = self.send(
+            "Runtime.evaluate", expression=expression, awaitPromise=True, returnByValue=True
+        )
         assert "exceptionDetails" not in done, (done["exceptionDetails"], self.messages)
         return done["result"].get("value")
 
@@ -165,17 +179,29 @@ class Browser:
     def press(self, key: str, code: int) -> None:
         """Press and release a key, by its name and Windows' code."""
         for kind in ("rawKeyDown", "keyUp"):
-            self.send("Input.dispatchKeyEvent", type=kind, key=key, code=key, windowsVirtualKeyCode=code)
+            self.send(
+                "Input.dispatchKeyEvent", type=kind, key=key, code=key, windowsVirtualKeyCode=code
+            )
 
     def drag(self, start: tuple[float, float], end: tuple[float, float]) -> None:
         """Press the left button at a point, move, and let go at another."""
         for kind, (x, y) in (("mousePressed", start), ("mouseMoved", end), ("mouseReleased", end)):
-            self.send("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", buttons=1, clickCount=1)
+            self.send(
+                "Input.dispatchMouseEvent",
+                type=kind,
+                x=x,
+                y=y,
+                button="left",
+                buttons=1,
+                clickCount=1,
+            )
 
     def _note(self, event: dict[str, Any]) -> None:
         found = event.get("params", {})
         if event.get("method") == "Runtime.consoleAPICalled":
-            self.messages.append(" ".join(str(a.get("value", a.get("description"))) for a in found["args"]))
+            self.messages.append(
+                " ".join(str(a.get("value", a.get("description"))) for a in found["args"])
+            )
         elif event.get("method") == "Runtime.exceptionThrown":
             self.messages.append(str(found["exceptionDetails"]))
         elif event.get("method") == "Network.requestWillBeSent":

@@ -92,7 +92,8 @@ def options_of(name: str) -> dict[str, Any]:
 def flag_of(command: str, option: str) -> str:
     """Return the long flag of an option; of one that is on in its command's call, its opposite."""
     found = options_of(command)[option]
-    on = found.default is True or option == "weighted"  # weights count unless a preset says otherwise
+    # weights count unless a preset says otherwise
+    on = found.default is True or option == "weighted"
     off = on and not {*found.secondary_opts} & {*CALLS[command].split()}
     return max(found.secondary_opts if off else found.opts, key=len)
 
@@ -149,7 +150,9 @@ def _common(names: str) -> dict[str, str]:
 
 VALUES: dict[str, dict[str, str]] = {
     "distill": {
-        **_common("count ratio fit min_psnr min_ssim views alpha photos method keep_region schedule"),
+        **_common(
+            "count ratio fit min_psnr min_ssim views alpha photos method keep_region schedule"
+        ),
         **_common("steps sh_degree size background up tile_rows render_model box where color"),
         "images": "other --photos",
         "held_out": "few.json",
@@ -169,7 +172,9 @@ VALUES: dict[str, dict[str, str]] = {
         "parents": "rows.npy",
     },
     "recover": {
-        **_common("views teacher photos schedule steps sh_degree split size background render_model"),
+        **_common(
+            "views teacher photos schedule steps sh_degree split size background render_model"
+        ),
         "images": "other --photos",
         "alpha": "mask --photos",
         "anchors": "fewer.ply --set period=1",
@@ -177,7 +182,9 @@ VALUES: dict[str, dict[str, str]] = {
         "weighted": "",
     },
     "adapt": {
-        **_common("views photos alpha teacher steps schedule sh_degree split size background preset"),
+        **_common(
+            "views photos alpha teacher steps schedule sh_degree split size background preset"
+        ),
         **_common("render_model"),
         "images": "other",
         "tolerance": "0 --steps 600",
@@ -303,7 +310,9 @@ ON: dict[str, dict[str, str]] = {
         "views_format": "distill ball.ply -r 8 --steps 3 --size 24 --views made --no-page -o out",
         "compare": "distill ball.ply -r 8 --steps 3 --size 24 --views photos.json --renders -o out",
     },
-    "adapt": dict.fromkeys(("alpha", "images"), "adapt small.ply --views photos.json --steps 3 -o out.ply"),
+    "adapt": dict.fromkeys(
+        ("alpha", "images"), "adapt small.ply --views photos.json --steps 3 -o out.ply"
+    ),
     "convert": {
         "color": "convert scan.las -o out.ply",
         "compress": "convert ball.ply -o out.glb",
@@ -311,7 +320,9 @@ ON: dict[str, dict[str, str]] = {
         "invert": "convert ball.ply --sphere 0,0,0.5,0.9 -o out.ply",
     },
     "lod": {
-        **dict.fromkeys(_CHOICES, "lod scan.las -r 1,4 --views views.json --size 24 --merge-only -o out"),
+        **dict.fromkeys(
+            _CHOICES, "lod scan.las -r 1,4 --views views.json --size 24 --merge-only -o out"
+        ),
         "images": "lod ball.ply -r 1,4 --views sizeless.json --steps 3 -o out",
         "steps": "lod ball.ply -r 1,4 --views photos.json --size 24 -o out",
         "place": "lod ball.ply -r 4,8 --views photos.json --size 24 --merge-only --format 3dtiles -o out",
@@ -382,7 +393,9 @@ def write_inputs(folder: Path) -> None:
     g2ard.save(folder / "stray.ply", under_a_sky(replace(ball, logit_opacities=faint)))
     cloud_of(folder / "cloud.ply", ball)
     classes, rgb = np.arange(400, dtype=np.uint8) % 2 + 2, np.arange(1200).reshape(400, 3) * 50
-    las(folder / "scan.las", ball.means.astype(float), rgb.astype(np.uint16), classification=classes)
+    las(
+        folder / "scan.las", ball.means.astype(float), rgb.astype(np.uint16), classification=classes
+    )
     g2ard.save_views(folder / "views.json", views)
     g2ard.save_views(folder / "few.json", around(10, (48, 36), 2.5))
     for name, scene in (("photos", ball), ("other", checkered_ball(300, seed=1))):
@@ -409,6 +422,8 @@ def write_inputs(folder: Path) -> None:
     sizeless = {"fl_x": 48.0, "fl_y": 48.0, "frames": []}
     for view in views:
         pose = np.linalg.inv(view.viewmat) * [1, -1, -1, 1]
-        sizeless["frames"].append({"file_path": f"photos/{view.name}.png", "transform_matrix": pose.tolist()})
+        sizeless["frames"].append(
+            {"file_path": f"photos/{view.name}.png", "transform_matrix": pose.tolist()}
+        )
     (folder / "sizeless.json").write_text(json.dumps(sizeless))
     (folder / "matches.py").write_text(_MATCHES)

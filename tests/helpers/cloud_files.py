@@ -22,7 +22,9 @@ def ply(path: Path, types: dict[str, str], rows: np.ndarray, faces: int = 0) -> 
     return path
 
 
-def columns(position: str, color: str, names: tuple[str, ...] = ("red", "green", "blue")) -> dict[str, str]:
+def columns(
+    position: str, color: str, names: tuple[str, ...] = ("red", "green", "blue")
+) -> dict[str, str]:
     return dict.fromkeys("xyz", position) | dict.fromkeys(names, color)
 
 
@@ -35,7 +37,9 @@ def las(
     **fields: np.ndarray,
 ) -> Path:
     point_format = 1 if rgb is None else point_format
-    header = laspy.LasHeader(point_format=point_format, version="1.4" if point_format > 5 else "1.2")
+    header = laspy.LasHeader(
+        point_format=point_format, version="1.4" if point_format > 5 else "1.2"
+    )
     header.offsets, header.scales = positions.min(0), np.array(scales)
     data = laspy.LasData(header)
     data.x, data.y, data.z = positions.T

@@ -13,4 +13,6 @@ def surface(count=400, seed=0):
 def lines(count, each, noise=0.004, seed=0):
     """A plane of 6 × 6 scanned in lines: points and the distance of lines."""
     x, y = np.tile(np.linspace(-3, 3, each), count), np.repeat(np.linspace(-3, 3, count), each)
-    return np.column_stack([x, y, np.random.default_rng(seed).normal(0, noise, len(x))]), 6 / (count - 1)
+    return np.column_stack([x, y, np.random.default_rng(seed).normal(0, noise, len(x))]), 6 / (
+        count - 1
+    )

@@ -62,16 +62,18 @@ def matrix_city(root: Path, scene: Splats, count: int = 16, size: int = 48) -> N
     pose, views = street / "pose" / "block_A", around(count, (size, size))
     pose.mkdir(parents=True)
     angle = 2 * float(np.arctan(size / 2 / views.Ks[0, 0, 0]))
-    lens = {"camera_angle_x": angle, "fl_x": float(views.Ks[0, 0, 0]), "fl_y": float(views.Ks[0, 0, 0])}
+    lens = {
+        "camera_angle_x": angle,
+        "fl_x": float(views.Ks[0, 0, 0]),
+        "fl_y": float(views.Ks[0, 0, 0]),
+    }
     lens |= {"k1": 0, "k2": 0, "k3": 0, "k4": 0, "p1": 0, "p2": 0, "cx": size / 2, "cy": size / 2}
     head = {**lens, "w": float(size), "h": float(size)}
     renderer = Renderer(scene)
     for split, rows in (("train", range(count - 4)), ("test", range(count - 4, count))):
         frames = []
         for i in rows:
-            where = (
-                f"{split}/small_city_road_{'horizon' if i % 2 else 'vertical'}{'_test' * (split == 'test')}"
-            )
+            where = f"{split}/small_city_road_{'horizon' if i % 2 else 'vertical'}{'_test' * (split == 'test')}"
             write_png(_made(street / where / f"{i:04d}.png"), renderer.clipped(views[i]))
             matrix = opengl(views.viewmats[i]).tolist()
             frames.append({"file_path": f"../../{where}/{i:04d}.png", "transform_matrix": matrix})
@@ -87,7 +89,8 @@ def matrix_city(root: Path, scene: Splats, count: int = 16, size: int = 48) -> N
     (block / "transforms.json").write_text(json.dumps({"camera_angle_x": angle, "frames": frames}))
     points = root / "small_city_pointcloud" / "point_cloud_ds20" / "street" / "Block_A.ply"
     colors = np.rint(255 * np.clip(0.5 + SH_C0 * scene.sh0[:, 0], 0, 1))
-    types = dict.fromkeys("xyz", "f8") | dict.fromkeys(("red", "green", "blue"), "u1")  # as Open3D writes it
+    # as Open3D writes it
+    types = dict.fromkeys("xyz", "f8") | dict.fromkeys(("red", "green", "blue"), "u1")
     ply(_made(points), types, np.concatenate([scene.means, colors], 1))
     for name in ("block_A.ply", "block_A_3M.ply"):
         write_splats(root / name, scene)
@@ -111,7 +114,11 @@ def mip_nerf_360(root: Path) -> None:
     for i, view in enumerate(POSES):
         q, t = quaternion(view[:3, :3]), view[:3, 3]
         rows.append(" ".join(map(str, (i + 1, *q, *t, 1, f"DSC{i:04d}.JPG"))) + "\n\n")
-        for folder, size in (("images", (400, 300)), ("images_2", (200, 150)), ("images_4", (100, 75))):
+        for folder, size in (
+            ("images", (400, 300)),
+            ("images_2", (200, 150)),
+            ("images_4", (100, 75)),
+        ):
             photo(root / folder / f"DSC{i:04d}.JPG", size, red=20 * i)
     (model / "images.txt").write_text("".join(rows))
 

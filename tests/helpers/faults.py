@@ -20,7 +20,16 @@ Fault = tuple[str | None, int | None] | str
 INJECTED = "injected fault"
 _STAGES = tuple(
     f"g2ard.{name}"
-    for name in ("io.", "jobs.", "levels.", "pipeline.", "rendering.", "report.", "stages.", "viewer.")
+    for name in (
+        "io.",
+        "jobs.",
+        "levels.",
+        "pipeline.",
+        "rendering.",
+        "report.",
+        "stages.",
+        "viewer.",
+    )
 )
 """Packages whose functions are stages of a command."""
 

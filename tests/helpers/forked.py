@@ -58,7 +58,9 @@ def _results() -> Iterator[NDArray[Any]]:
 
 def digests() -> list[str]:
     """Return a hash of what each kernel returns."""
-    return [hashlib.sha256(np.ascontiguousarray(array).tobytes()).hexdigest() for array in _results()]
+    return [
+        hashlib.sha256(np.ascontiguousarray(array).tobytes()).hexdigest() for array in _results()
+    ]
 
 
 def gpu_digest() -> str:

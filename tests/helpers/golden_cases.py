@@ -51,7 +51,9 @@ CALLS: dict[str, Callable[[Any], Any]] = {
     "simplify": lambda g: g.simplify(
         "in/ball.ply", ratio=5, views="in/views.json", settings={"dilation": 0.3}
     ),
-    "simplify-scene": lambda g: g.simplify(g.load("in/ball.ply"), count=70, method="fast", blind=True),
+    "simplify-scene": lambda g: g.simplify(
+        g.load("in/ball.ply"), count=70, method="fast", blind=True
+    ),
     "simplify-config": lambda g: g.simplify(
         "in/ball.ply", ratio=5, config=g.preset("paper", g.SimplifyConfig())
     ),
@@ -60,9 +62,15 @@ CALLS: dict[str, Callable[[Any], Any]] = {
     ),
     "recover": lambda g: g.recover(g.load("in/small.ply"), _targets(g), steps=9, seed=2),
     "recover-paths": lambda g: g.recover(
-        "in/small.ply", views="in/photos", photos=True, preset="lift", settings={"steps": 9, "sh_degree": 0}
+        "in/small.ply",
+        views="in/photos",
+        photos=True,
+        preset="lift",
+        settings={"steps": 9, "sh_degree": 0},
     ),
-    "adapt": lambda g: g.adapt(g.load("in/small.ply"), _targets(g, photos=True), g.AdaptConfig(steps=9)),
+    "adapt": lambda g: g.adapt(
+        g.load("in/small.ply"), _targets(g, photos=True), g.AdaptConfig(steps=9)
+    ),
     "distill": lambda g: g.distill(
         "in/ball.ply", ratio=5, views="in/views.json", steps=9, size=32, settings=FAR
     ),
@@ -75,13 +83,23 @@ CALLS: dict[str, Callable[[Any], Any]] = {
     ),
     "lod": lambda g: g.lod("in/ball.ply", ratios=(2, 4), views="in/views.json", steps=9, size=32),
     "clean": lambda g: g.clean("in/sky.ply"),
-    "convert": lambda g: g.convert(["in/ball.ply", "in/small.ply"], box=(-1, -1, -1, 1, 1, 0.5), scale=2),
-    "lift": lambda g: g.lift(g.load_points("in/cloud.ply").positions, g.load_points("in/cloud.ply").colors),
+    "convert": lambda g: g.convert(
+        ["in/ball.ply", "in/small.ply"], box=(-1, -1, -1, 1, 1, 0.5), scale=2
+    ),
+    "lift": lambda g: g.lift(
+        g.load_points("in/cloud.ply").positions, g.load_points("in/cloud.ply").colors
+    ),
     "evaluate": lambda g: g.evaluate(g.load("in/small.ply"), _targets(g)),
-    "render": lambda g: g.render(g.load("in/ball.ply"), g.load_views("in/views.json")[3], median=True),
+    "render": lambda g: g.render(
+        g.load("in/ball.ply"), g.load_views("in/views.json")[3], median=True
+    ),
     "poses": lambda g: g.make_pool(g.load("in/ball.ply"), 6, size=SIZE),
-    "views": lambda g: [g.load_views(f"in/{name}") for name in ("photos", "masked", "colmap", "trained")],
-    "presets": lambda g: [g.preset(name) for name in ("auto", "paper", "paper-noisy", "lift", "noisy")],
+    "views": lambda g: [
+        g.load_views(f"in/{name}") for name in ("photos", "masked", "colmap", "trained")
+    ],
+    "presets": lambda g: [
+        g.preset(name) for name in ("auto", "paper", "paper-noisy", "lift", "noisy")
+    ],
     "no-budget": lambda g: g.simplify("in/ball.ply"),
     "no-setting": lambda g: g.distill("in/ball.ply", ratio=4, settings={"nothing": 1}),
     "no-scene": lambda g: g.load("in/short.ply"),
@@ -117,7 +135,13 @@ STOPPED: dict[str, Callable[[Any, Path, Any], Any]] = {
         g.load("in/small.ply"), _targets(g), steps=30, checkpoint=work / "c.npz", progress=progress
     ),
     "lod": lambda g, work, progress: g.lod(
-        "in/ball.ply", ratios=(2, 4), views="in/views.json", size=32, steps=20, work=work, progress=progress
+        "in/ball.ply",
+        ratios=(2, 4),
+        views="in/views.json",
+        size=32,
+        steps=20,
+        work=work,
+        progress=progress,
     ),
     "ingest": lambda g, work, progress: g.ingest(
         "in/town.ply", work / "tiles", tile_rows=500, progress=progress
@@ -134,8 +158,12 @@ def make_inputs(folder: Path) -> None:
     _write_scene(folder / "ball.ply", ball)
     _write_scene(folder / "small.ply", _ball(100, seed=7))
     _write_scene(folder / "town.ply", town)
-    _write_scene(folder / "sky.ply", {name: np.concatenate([ball[name], _sky(60)[name]]) for name in ball})
-    _write_scene(folder / "nan.ply", {**ball, "y": np.where(np.arange(400) == 17, np.nan, ball["y"])})
+    _write_scene(
+        folder / "sky.ply", {name: np.concatenate([ball[name], _sky(60)[name]]) for name in ball}
+    )
+    _write_scene(
+        folder / "nan.ply", {**ball, "y": np.where(np.arange(400) == 17, np.nan, ball["y"])}
+    )
     _write_scene(folder / "untyped.ply", {name: ball[name] for name in ball if name != "opacity"})
     (folder / "short.ply").write_bytes((folder / "ball.ply").read_bytes()[:-50])
     points, colors = _surface(900)
@@ -171,12 +199,20 @@ def _colour(places: np.ndarray) -> np.ndarray:
     return np.where(odd[..., None] > 0, [230, 128, 26], [26, 77, 179]).astype(np.uint8)
 
 
-def _scene(means: np.ndarray, quats: Any, sigmas: Any, opacity: Any, colors: np.ndarray, seed: int) -> Any:
+def _scene(
+    means: np.ndarray, quats: Any, sigmas: Any, opacity: Any, colors: np.ndarray, seed: int
+) -> Any:
     """Columns of a trained scene of SH degree 1; `opacity` holds logits."""
     rng, count = np.random.default_rng(seed), len(means)
     names = [*"xyz", *(f"rot_{i}" for i in range(4)), *(f"scale_{i}" for i in range(3)), "opacity"]
     names += [*(f"f_dc_{i}" for i in range(3)), *(f"f_rest_{i}" for i in range(9))]
-    parts = [means, quats, np.log(sigmas), np.reshape(opacity, (count, 1)), (colors / 255 - 0.5) / 0.28209479]
+    parts = [
+        means,
+        quats,
+        np.log(sigmas),
+        np.reshape(opacity, (count, 1)),
+        (colors / 255 - 0.5) / 0.28209479,
+    ]
     table = np.concatenate([*parts, rng.normal(0, 0.03, (count, 9))], axis=1)
     return dict(zip(names, table.T, strict=True))
 
@@ -188,7 +224,9 @@ def _ball(count: int, seed: int = 0) -> Any:
     size = 1.6 * np.sqrt(4 * np.pi / count) / 2
     quats = np.stack([1 + z, -y, x, 0 * x], 1)
     logits = np.random.default_rng(seed).normal(2.5, 0.5, count)
-    return _scene(normals, quats, np.tile([size, size, size / 10], (count, 1)), logits, colors, seed)
+    return _scene(
+        normals, quats, np.tile([size, size, size / 10], (count, 1)), logits, colors, seed
+    )
 
 
 def _town(count: int) -> Any:
@@ -212,7 +250,9 @@ def _sky(count: int) -> Any:
     sigmas[::6] = [0.5, 1e-3, 1e-3]
     distances = np.where(np.arange(count) % 6, rng.uniform(20, 60, count), 2)
     means, quats = towards * distances[:, None], rng.normal(size=(count, 4))
-    return _scene(means, quats, sigmas, rng.normal(-1, 1, count), rng.integers(0, 255, (count, 3)), 4)
+    return _scene(
+        means, quats, sigmas, rng.normal(-1, 1, count), rng.integers(0, 255, (count, 3)), 4
+    )
 
 
 def _write_ply(path: Path, columns: dict[str, np.ndarray], types: dict[str, str]) -> None:
@@ -278,7 +318,9 @@ def _photo(pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.where(hit[..., None], _colour(eye + far[..., None] * rays), 0).astype(np.uint8), hit
 
 
-def _write_views(path: Path, poses: list[np.ndarray], width: int = SIZE[0], height: int = SIZE[1]) -> None:
+def _write_views(
+    path: Path, poses: list[np.ndarray], width: int = SIZE[0], height: int = SIZE[1]
+) -> None:
     K = [[width, 0, width / 2], [0, width, height / 2], [0, 0, 1]]
     views = [
         {
@@ -307,14 +349,23 @@ def _write_photos(folder: Path, poses: list[np.ndarray], origin: np.ndarray, mas
         world[:3, 1:3] *= -1  # OpenGL's axes
         frames.append({"file_path": f"images/{i:03d}.png", "transform_matrix": world.tolist()})
         pixels, hit = _photo(pose)
-        _write_image(folder / f"images/{i:03d}.png", np.dstack([pixels, 255 * hit.astype(np.uint8)]))
+        _write_image(
+            folder / f"images/{i:03d}.png", np.dstack([pixels, 255 * hit.astype(np.uint8)])
+        )
         if masks:
             frames[-1]["mask_path"] = f"masks/{i:03d}.png"
             kept = np.full(SIZE[::-1], 255, np.uint8)
             kept[:, 3 * SIZE[0] // 4 :] = 0
             _write_image(folder / f"masks/{i:03d}.png", kept)
     (width, height), focal = SIZE, SIZE[0]
-    lens = {"fl_x": focal, "fl_y": focal, "cx": width / 2, "cy": height / 2, "w": width, "h": height}
+    lens = {
+        "fl_x": focal,
+        "fl_y": focal,
+        "cx": width / 2,
+        "cy": height / 2,
+        "w": width,
+        "h": height,
+    }
     (folder / "transforms.json").write_text(json.dumps({**lens, "frames": frames}))
 
 
@@ -333,7 +384,10 @@ def _write_colmap(folder: Path, poses: list[np.ndarray]) -> None:
         _write_image(folder / f"images/{i:03d}.png", _photo(pose)[0])
     (model / "images.txt").write_text("".join(lines))
     points = zip(*_surface(80, seed=5), strict=True)
-    rows = [f"{i} {x} {y} {z} {r} {g} {b} 0.5 1 0 2 0\n" for i, ((x, y, z), (r, g, b)) in enumerate(points)]
+    rows = [
+        f"{i} {x} {y} {z} {r} {g} {b} 0.5 1 0 2 0\n"
+        for i, ((x, y, z), (r, g, b)) in enumerate(points)
+    ]
     (model / "points3D.txt").write_text("".join(rows))
 
 
@@ -342,7 +396,10 @@ def _write_trained(folder: Path, scene: dict[str, np.ndarray], poses: list[np.nd
     _write_scene(folder / "point_cloud/iteration_7/point_cloud.ply", scene)
     cameras = []
     for i, pose in enumerate(poses):
-        world, lens = np.linalg.inv(pose), {"fx": SIZE[0], "fy": SIZE[0], "width": SIZE[0], "height": SIZE[1]}
+        world, lens = (
+            np.linalg.inv(pose),
+            {"fx": SIZE[0], "fy": SIZE[0], "width": SIZE[0], "height": SIZE[1]},
+        )
         where = {"position": world[:3, 3].tolist(), "rotation": world[:3, :3].tolist()}
         cameras.append({"id": i, "img_name": f"{i:03d}", **lens, **where})
     (folder / "cameras.json").write_text(json.dumps(cameras))

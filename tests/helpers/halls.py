@@ -25,7 +25,10 @@ def hall(spacing: float = 0.09, plate: float = 0.5) -> Splats:
         low = (*rng.uniform((2, 2), (x - 3, y - 3)), 0.0)
         parts.append(_block(low, rng.uniform(0.6, 1.6, 3), spacing / 1.5, rng.random(3)))
     for column in np.arange(6, x - 3, 6):
-        parts += [_block((column, side, 0), (0.5, 0.5, z), spacing, (0.8, 0.8, 0.75)) for side in (6, 15.5)]
+        parts += [
+            _block((column, side, 0), (0.5, 0.5, z), spacing, (0.8, 0.8, 0.75))
+            for side in (6, 15.5)
+        ]
     ceiling = rectangle((0, 0, z), (x, 0, 0), (0, y, 0), plate, (0, 0, 1))
     haze = rng.uniform(0.8, 3, (len(ceiling), 1)) * ceiling.scales
     parts.append(
@@ -73,7 +76,9 @@ def painted(part: Splats, what: str) -> Splats:
         return _coloured(part, shade[:, None] * np.array([1.0, 0.9, 0.75]))
     along = x + y
     frame = (z > 1.2) & (z < 3.4) & (along % 4 > 1)
-    inner = np.stack([0.5 + 0.5 * np.sin(k * along + 2 * z + k * np.floor(along / 4)) for k in (1, 2, 3)], 1)
+    inner = np.stack(
+        [0.5 + 0.5 * np.sin(k * along + 2 * z + k * np.floor(along / 4)) for k in (1, 2, 3)], 1
+    )
     return _coloured(part, np.where(frame[:, None], inner, 0.85))
 
 

@@ -9,7 +9,9 @@ from g2ard.io.tile_store import TileStore, packed
 from g2ard.scene.splats import Splats
 
 
-def town(count: int = 6000, degree: int = 0, seed: int = 0, offset: tuple[float, ...] = (0, 0, 0)) -> Splats:
+def town(
+    count: int = 6000, degree: int = 0, seed: int = 0, offset: tuple[float, ...] = (0, 0, 0)
+) -> Splats:
     """Streets of uneven density, and a few floaters far out."""
     rng = np.random.default_rng(seed)
     means = rng.normal(size=(count, 3)) * [30, 12, 2] + rng.choice([-40.0, 0, 55], (count, 1))

@@ -75,7 +75,9 @@ def lasting_keys() -> Iterator[None]:
             def key() -> str:
                 return key_of([name, scene, settings()])
 
-            return compare(name, key, lambda: run(self, name, scene, settings, *more), scene, *given)
+            return compare(
+                name, key, lambda: run(self, name, scene, settings, *more), scene, *given
+            )
 
         return watched
 

@@ -35,7 +35,9 @@ def outputs_of(source: str, names: dict[str, Any], count: int) -> list[dict[str,
             shown = eval(compile(ast.Expression(last.value), "notebook", "eval"), names)
     found: list[dict[str, Any]] = []
     if text := printed.getvalue():
-        found.append({"name": "stdout", "output_type": "stream", "text": text.splitlines(keepends=True)})
+        found.append(
+            {"name": "stdout", "output_type": "stream", "text": text.splitlines(keepends=True)}
+        )
     if shown is not None:
         data: dict[str, Any] = {"text/plain": [re.sub(" at 0x[0-9A-Fa-f]+", "", repr(shown))]}
         if hasattr(shown, "_repr_png_") and (image := shown._repr_png_()):
@@ -43,7 +45,12 @@ def outputs_of(source: str, names: dict[str, Any], count: int) -> list[dict[str,
         elif hasattr(shown, "_repr_html_"):
             data["text/html"] = [shown._repr_html_()]
         found.append(
-            {"data": data, "execution_count": count, "metadata": {}, "output_type": "execute_result"}
+            {
+                "data": data,
+                "execution_count": count,
+                "metadata": {},
+                "output_type": "execute_result",
+            }
         )
     return found
 
@@ -54,7 +61,9 @@ def text_of(outputs: list[dict[str, Any]]) -> list[str]:
     return [line for text in texts for line in text.splitlines()]
 
 
-def execute(notebook: dict[str, Any], names: dict[str, Any], folder: Path) -> list[list[dict[str, Any]]]:
+def execute(
+    notebook: dict[str, Any], names: dict[str, Any], folder: Path
+) -> list[list[dict[str, Any]]]:
     """Run all code cells in order in a folder, and return the outputs of each."""
     sources = ["".join(cell["source"]) for cell in code_of(notebook)]
     with contextlib.chdir(folder):

@@ -53,7 +53,9 @@ def opened(page: Path, camera: Camera) -> Camera:
     assert found
     half = half_height(json.loads(found[1]), camera.width / camera.height)
     focal = camera.height / 2 / half
-    return replace(camera, K=np.array([[focal, 0, camera.K[0, 2]], [0, focal, camera.K[1, 2]], [0, 0, 1]]))
+    return replace(
+        camera, K=np.array([[focal, 0, camera.K[0, 2]], [0, focal, camera.K[1, 2]], [0, 0, 1]])
+    )
 
 
 def show(browser: Browser, page: Path | str) -> None:
@@ -76,7 +78,9 @@ def drawn(
     wanted = f"{{width: {width}, height: {height}, supersample: 1}}"
     until = time.monotonic() + 60
     while True:
-        shot = browser.run(f"g2ard.ready.then(viewers => viewers[{index}].captureFrame({wanted}))")["data"]
+        shot = browser.run(f"g2ard.ready.then(viewers => viewers[{index}].captureFrame({wanted}))")[
+            "data"
+        ]
         pixels = np.frombuffer(base64.b64decode(shot), np.uint8).reshape(height, width, 4)
         picture = pixels[..., :3] / np.float32(255)
         if accept(picture) or time.monotonic() > until:
@@ -89,7 +93,9 @@ def like(expected: np.ndarray, decibels: float) -> Callable[[np.ndarray], bool]:
     return lambda picture: psnr(picture, expected) > decibels
 
 
-def assert_shows(browser: Browser, expected: np.ndarray, decibels: float, index: int = 0) -> np.ndarray:
+def assert_shows(
+    browser: Browser, expected: np.ndarray, decibels: float, index: int = 0
+) -> np.ndarray:
     """Check that a viewer draws an expected picture; return what it draws."""
     height, width = expected.shape[:2]
     picture = drawn(browser, like(expected, decibels), index, (width, height))

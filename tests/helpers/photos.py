@@ -33,7 +33,9 @@ def photographed(
     return replace(views, image_paths=paths)
 
 
-def cloud_of(path: Path, scene: g2ard.Splats, origin: ArrayLike = 0, **fields: NDArray[Any]) -> None:
+def cloud_of(
+    path: Path, scene: g2ard.Splats, origin: ArrayLike = 0, **fields: NDArray[Any]
+) -> None:
     """Write the means of a scene, moved to `origin`, as a coloured .ply, .las or .laz cloud.
 
     Args:
@@ -85,7 +87,9 @@ def rgba_photos_of(folder: Path, count: int = 24, distance: float = 3.0) -> g2ar
         names.append(f"{'test' if i % 3 == 0 else 'train'}/r_{i}")
         path = folder / f"{names[-1]}.png"
         path.parent.mkdir(parents=True, exist_ok=True)
-        Image.fromarray(np.rint(np.concatenate([straight, alpha], 2) * 255).astype(np.uint8)).save(path)
+        Image.fromarray(np.rint(np.concatenate([straight, alpha], 2) * 255).astype(np.uint8)).save(
+            path
+        )
     angle = 2 * float(np.arctan(views.widths[0] / 2 / views.Ks[0, 0, 0]))
     for split in ("train", "test"):
         listed = [

@@ -30,7 +30,12 @@ _IMPORTERS = [
     *("g2ard.jobs.run_views", "benchmarks.views", "benchmarks.kinds.select"),
 ]
 """Modules that have `plan_pool`."""
-_SHOWING = ["g2ard.jobs.run_views", "g2ard.jobs.notebook", "g2ard.jobs.viewer_frame", "g2ard.jobs.scoring"]
+_SHOWING = [
+    "g2ard.jobs.run_views",
+    "g2ard.jobs.notebook",
+    "g2ard.jobs.viewer_frame",
+    "g2ard.jobs.scoring",
+]
 """Modules that have `best_views`."""
 _MOST = 100
 """Plans that are kept in memory."""
@@ -62,10 +67,15 @@ def plan_small_scenes(monkeypatch: pytest.MonkeyPatch, *, coarse: bool = True) -
         monkeypatch.setattr("g2ard.poses.matter._CELLS", _CELLS)
 
 
-def _shown(splats: Splats, count: int = 1, cameras: Cameras | None = None, **options: Any) -> Cameras:
+def _shown(
+    splats: Splats, count: int = 1, cameras: Cameras | None = None, **options: Any
+) -> Cameras:
     if cameras is not None:
-        return best_views(splats, count, cameras, **options)  # has paths of photos, which no key holds
-    key = f"best {splats.fingerprint()} {splats.up} {count} {matter._CELLS} {sorted(options.items())}"
+        # has paths of photos, which no key holds
+        return best_views(splats, count, cameras, **options)
+    key = (
+        f"best {splats.fingerprint()} {splats.up} {count} {matter._CELLS} {sorted(options.items())}"
+    )
     return _kept(key, lambda: best_views(splats, count, **options))
 
 

@@ -8,7 +8,9 @@ from plyfile import PlyData, PlyElement
 from g2ard.scene.splats import Splats
 
 
-def scene(count: int = 20, degree: int = 3, seed: int = 0, offset: tuple[float, ...] = (0, 0, 0)) -> Splats:
+def scene(
+    count: int = 20, degree: int = 3, seed: int = 0, offset: tuple[float, ...] = (0, 0, 0)
+) -> Splats:
     rng = np.random.default_rng(seed)
     rest = (degree + 1) ** 2 - 1
     means, quats = rng.normal(size=(count, 3)), rng.normal(size=(count, 4))
@@ -35,7 +37,9 @@ def columns(splats: Splats) -> dict[str, np.ndarray]:
     return out
 
 
-def save(path: Path, properties: dict[str, np.ndarray], dtype: str = "f4", **options: object) -> Path:
+def save(
+    path: Path, properties: dict[str, np.ndarray], dtype: str = "f4", **options: object
+) -> Path:
     rows = np.empty(len(next(iter(properties.values()))), [(name, dtype) for name in properties])
     for name, values in properties.items():
         rows[name] = values

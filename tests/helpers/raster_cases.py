@@ -30,13 +30,17 @@ def scene(seed: int, n: int, degree: int = 3, *, size: float = 0.1, spread: floa
     return {k: v.astype(np.float32) for k, v in values.items()}
 
 
-def camera(width: int, height: int, *, distance: float = 4.0, off: float = 0.0, seed: int = 0) -> Cameras:
+def camera(
+    width: int, height: int, *, distance: float = 4.0, off: float = 0.0, seed: int = 0
+) -> Cameras:
     rng = np.random.default_rng(seed)
     eye = rng.normal(size=3)
     eye *= distance / np.linalg.norm(eye)
     f = 0.9 * max(width, height)
     K = [[f, 0, width / 2 + off * width], [0, 1.1 * f, height / 2 - off * height], [0, 0, 1]]
-    return Cameras.from_lists([look_at(eye, rng.normal(size=3) * 0.2)], [K], [(width, height)], ["v"])
+    return Cameras.from_lists(
+        [look_at(eye, rng.normal(size=3) * 0.2)], [K], [(width, height)], ["v"]
+    )
 
 
 def splats_of(p: Params) -> Splats:

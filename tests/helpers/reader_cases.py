@@ -75,7 +75,9 @@ def result(folder: Path) -> Path:
 def tiles(folder: Path) -> Path:
     """Return the manifest of a folder of tiles."""
     return (
-        ingest(saved(folder / "a.ply", write_splats, truth(30, 1)), folder / "tiles", tile_rows=12).folder
+        ingest(
+            saved(folder / "a.ply", write_splats, truth(30, 1)), folder / "tiles", tile_rows=12
+        ).folder
         / "tiles.json"
     )
 
@@ -91,7 +93,9 @@ MAKERS: dict[str, Callable[[Path], Path]] = {
     "meta.json": lambda f: sog_folder(f, parts()) / "meta.json",
     "lod-meta.json": levels,
     "glb": lambda f: saved(f / "a.glb", write_splats, truth(9, 1)),
-    "cloud": lambda f: ply(f / "a.ply", columns("f4", "u1"), np.arange(36.0).reshape(6, 6), faces=3),
+    "cloud": lambda f: ply(
+        f / "a.ply", columns("f4", "u1"), np.arange(36.0).reshape(6, 6), faces=3
+    ),
     "ascii cloud": lambda f: ascii_cloud(f / "a.ply"),
     "las": lambda f: las(f / "a.las", np.arange(30.0).reshape(10, 3), np.ones((10, 3), int)),
     "laz": lambda f: las(f / "a.laz", np.arange(30.0).reshape(10, 3), np.ones((10, 3), int)),

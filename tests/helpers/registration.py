@@ -17,6 +17,8 @@ CONFIG = RegisterConfig(size=160, coarsest=40)
 BALL = checkered_ball(2500)
 
 
-def pyramid_of(camera: Camera, image: np.ndarray, config: RegisterConfig) -> list[tuple[Camera, Level]]:
+def pyramid_of(
+    camera: Camera, image: np.ndarray, config: RegisterConfig
+) -> list[tuple[Camera, Level]]:
     cameras = [Cameras.of([camera]).resized(side)[0] for side in config.levels()]
     return [(c, level_of(grey_of(resize(image, (c.width, c.height))))) for c in cameras]

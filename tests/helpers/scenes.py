@@ -22,7 +22,8 @@ def checkered_ball(n: int = 3000, seed: int = 0) -> Splats:
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     squares = (np.floor(3 * normals[:, 0]) + np.floor(3 * normals[:, 1])) % 2
     color = np.where(squares[:, None] > 0, [0.9, 0.5, 0.1], [0.1, 0.3, 0.7])
-    half = np.stack([1 + normals[:, 2], -normals[:, 1], normals[:, 0], np.zeros(n)], 1)  # z axis → normal
+    # z axis → normal
+    half = np.stack([1 + normals[:, 2], -normals[:, 1], normals[:, 0], np.zeros(n)], 1)
     size = 1.6 * np.sqrt(4 * np.pi / n) / 2
     return Splats.create(
         normals.astype(np.float32),
@@ -75,7 +76,8 @@ def under_a_sky(scene: Splats, count: int = 300, seed: int = 0) -> Splats:
         sh0=rng.normal(0, 0.6, (count, 1, 3)),
     ).with_sh_degree(scene.sh_degree)
     return replace(
-        scene, **{name: np.concatenate([getattr(scene, name), getattr(layers, name)]) for name in ARRAYS}
+        scene,
+        **{name: np.concatenate([getattr(scene, name), getattr(layers, name)]) for name in ARRAYS},
     )
 
 
@@ -89,7 +91,9 @@ def around(count: int = 16, size: tuple[int, int] = (64, 48), distance: float = 
     return views_at([look_at(eye, [0, 0, 0]) for eye in eyes], size, size[0])
 
 
-def views_at(poses: Sequence[ArrayLike], size: tuple[int, int] = (64, 48), focal: float = 60.0) -> Cameras:
+def views_at(
+    poses: Sequence[ArrayLike], size: tuple[int, int] = (64, 48), focal: float = 60.0
+) -> Cameras:
     """Views at poses, (4, 4) camera_from_world, with one size and focal length in pixels."""
     (width, height), count = size, len(poses)
     K = [[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]]

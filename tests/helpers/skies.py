@@ -21,15 +21,22 @@ def under_sky(scene: Splats, share: float, distance: float, lowest: float = -1.0
     count = round(len(scene) * share / (1 - share))
     ways = fibonacci(count, lowest)
     clouds = 0.6 + 0.25 * np.sin(6 * ways[:, :1]) * np.cos(5 * ways[:, 1:2])
-    sky = discs(middle + radius * ways, -ways, 0.6 * radius * np.sqrt(2 * np.pi * (1 - lowest) / count))
+    sky = discs(
+        middle + radius * ways, -ways, 0.6 * radius * np.sqrt(2 * np.pi * (1 - lowest) / count)
+    )
     return joined(scene, coloured(sky, clouds * np.array([0.8, 0.9, 1.0])))
 
 
 def courtyard(spacing: float = 0.07) -> Splats:
     """Return a paved yard of 8 by 8 with a house of painted boards and a bench; z is up."""
     ground = rectangle((-4, -4, 0), (8, 0, 0), (0, 8, 0), spacing, (0, 0, 1))
-    paving = 0.35 + 0.3 * ((np.floor(ground.means[:, :1] / 0.5) + np.floor(ground.means[:, 1:2] / 0.5)) % 2)
-    house, bench = box((-3, 1, 0), (1, 3.5, 2.4), spacing), box((1.5, -2, 0), (3, -1.5, 0.5), spacing)
+    paving = 0.35 + 0.3 * (
+        (np.floor(ground.means[:, :1] / 0.5) + np.floor(ground.means[:, 1:2] / 0.5)) % 2
+    )
+    house, bench = (
+        box((-3, 1, 0), (1, 3.5, 2.4), spacing),
+        box((1.5, -2, 0), (3, -1.5, 0.5), spacing),
+    )
     boards = 0.3 + 0.5 * (np.floor(house.means[:, 2:] / 0.3) % 2)
     return joined(
         coloured(ground, paving * np.array([1.0, 0.95, 0.85])),

@@ -26,7 +26,9 @@ def square(rows: np.ndarray, side: int = 4) -> np.ndarray:
 def parts(count: int = 10, bands: int = 1, seed: int = 0, version: int = 2) -> dict[str, bytes]:
     """The files of a small scene, random codes."""
     rng = np.random.default_rng(seed)
-    codes = {name: rng.integers(0, 256, (count, 4)) for name in ("low", "high", "scales", "quats", "sh0")}
+    codes = {
+        name: rng.integers(0, 256, (count, 4)) for name in ("low", "high", "scales", "quats", "sh0")
+    }
     codes["quats"][:, 3] = 252 + np.arange(count) % 4
     codes["sh0"][:, 3] = np.clip(codes["sh0"][:, 3], 1, 254)
     files = {f"{name}.webp": webp(square(rows)) for name, rows in codes.items()}
@@ -47,7 +49,11 @@ def parts(count: int = 10, bands: int = 1, seed: int = 0, version: int = 2) -> d
         meta["scales"]["codebook"] = np.linspace(-9, -1, 256).tolist()
         meta["sh0"]["codebook"] = np.linspace(-3, 3, 256).tolist()
         if rest:
-            meta["shN"] |= {"codebook": np.linspace(-1, 1, 256).tolist(), "bands": bands, "count": 128}
+            meta["shN"] |= {
+                "codebook": np.linspace(-1, 1, 256).tolist(),
+                "bands": bands,
+                "count": 128,
+            }
     else:
         meta["means"]["shape"] = [count, 3]
         meta["scales"] |= {"mins": [-9.0, -8, -7], "maxs": [-1.0, -2, -3]}

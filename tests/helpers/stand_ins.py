@@ -93,7 +93,13 @@ def _cloud(path: Path) -> None:
 
 def _map_cloud(path: Path) -> None:
     rows = np.arange(len(SCENE))
-    cloud_of(path, SCENE, ESTONIA, classification=(rows % 2 + 2).astype("u1"), intensity=rows.astype("u2"))
+    cloud_of(
+        path,
+        SCENE,
+        ESTONIA,
+        classification=(rows % 2 + 2).astype("u1"),
+        intensity=rows.astype("u2"),
+    )
 
 
 def _photos(folder: Path) -> None:
@@ -117,9 +123,12 @@ def _colmap(folder: Path, origin: Sequence[float] = (0, 0, 0)) -> None:
     moved = views.viewmats.copy()
     moved[:, :3, 3] -= moved[:, :3, :3] @ np.array(origin)
     names = tuple(f"{name}.png" for name in views.names)
-    write_views(folder, replace(views, viewmats=moved, names=names), format="colmap", overwrite=True)
+    write_views(
+        folder, replace(views, viewmats=moved, names=names), format="colmap", overwrite=True
+    )
     rows = [
-        f"{i} {x} {y} {z} 128 128 128 0.5 1 0 2 0" for i, (x, y, z) in enumerate(SCENE.means[::4] + origin)
+        f"{i} {x} {y} {z} 128 128 128 0.5 1 0 2 0"
+        for i, (x, y, z) in enumerate(SCENE.means[::4] + origin)
     ]
     (folder / "sparse/0/points3D.txt").write_text("\n".join(rows) + "\n")
 
@@ -167,9 +176,24 @@ def _run(folder: Path) -> None:
     """A distilled scene; the files that `distill` read are not in it."""
     dense = folder.with_name("scene.ply")
     _trained(dense)
-    asked = ("distill", dense.name, "-r", "4", "--steps", "2", "--size", "32", "--no-page", "-o", folder.name)
+    asked = (
+        "distill",
+        dense.name,
+        "-r",
+        "4",
+        "--steps",
+        "2",
+        "--size",
+        "32",
+        "--no-page",
+        "-o",
+        folder.name,
+    )
     subprocess.run(
-        [sys.executable, "-m", "g2ard", *asked, "-q"], cwd=folder.parent, env=environment(), check=True
+        [sys.executable, "-m", "g2ard", *asked, "-q"],
+        cwd=folder.parent,
+        env=environment(),
+        check=True,
     )
     dense.unlink()
     dense.with_name("cameras.json").unlink()
@@ -207,7 +231,9 @@ def _survey(path: Path) -> None:
 
 
 STAND_INS: dict[str, Callable[[Path], None]] = {
-    **dict.fromkeys(("scene.ply", "scan.ply", "dense.ply", "city.ply", "room.ply", "tree.spz"), _trained),
+    **dict.fromkeys(
+        ("scene.ply", "scan.ply", "dense.ply", "city.ply", "room.ply", "tree.spz"), _trained
+    ),
     **dict.fromkeys(("guitar.compressed.ply", "park24.ply"), _trained),
     "cloud.ply": _cloud,
     **dict.fromkeys(("cloud.laz", "city.laz", "map.laz", "east.laz", "west.laz"), _map_cloud),

@@ -19,10 +19,13 @@ needs_processes = pytest.mark.skipif(
 )
 """Mark of tests of benchmarks that run commands as processes."""
 
-needs_modes = pytest.mark.skipif(os.name == "nt", reason="on Windows a folder's mode keeps nobody out")
+needs_modes = pytest.mark.skipif(
+    os.name == "nt", reason="on Windows a folder's mode keeps nobody out"
+)
 
 needs_proc = pytest.mark.skipif(
-    not Path(f"/proc/self/task/{os.getpid()}/children").exists(), reason="needs /proc to list child processes"
+    not Path(f"/proc/self/task/{os.getpid()}/children").exists(),
+    reason="needs /proc to list child processes",
 )
 """Mark of tests that look for worker processes."""
 

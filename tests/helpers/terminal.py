@@ -34,7 +34,9 @@ class Terminal:
     def __init__(self) -> None:
         self._server = subprocess.Popen(
             [sys.executable, "-m", "helpers.terminal"],
-            env=environment(OPENBLAS_NUM_THREADS="1", PYTHONPATH=f"{ROOT}{os.pathsep}{ROOT / 'tests'}"),
+            env=environment(
+                OPENBLAS_NUM_THREADS="1", PYTHONPATH=f"{ROOT}{os.pathsep}{ROOT / 'tests'}"
+            ),
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,
@@ -71,7 +73,9 @@ class Terminal:
         lines = [line.rstrip() for line in screen.display]
         while lines and not lines[-1]:
             lines.pop()
-        return Screen(found["status"], found["out"], found["received"], lines, not screen.cursor.hidden)
+        return Screen(
+            found["status"], found["out"], found["received"], lines, not screen.cursor.hidden
+        )
 
     def close(self) -> None:
         self._server.communicate()
@@ -91,7 +95,13 @@ def _serve() -> None:
 
     # Commands on tiny scenes end before the live line would appear.
     console._LIVE_LINE_DELAY, console._LIVE_LINE_PERIOD, console._SILENT_SECONDS = 0.0, 0.02, 0.04  # type: ignore[misc]
-    for name in ("rich.live", "rich.progress_bar", "rich.table", "g2ard.pipeline", "g2ard.jobs.distill"):
+    for name in (
+        "rich.live",
+        "rich.progress_bar",
+        "rich.table",
+        "g2ard.pipeline",
+        "g2ard.jobs.distill",
+    ):
         import_module(name)
     for name in COMMANDS:
         import_module(f"g2ard.cli.commands.{name}")

@@ -24,7 +24,8 @@ def town(count: int = 9000, seed: int = 0) -> Splats:
     ground = rng.uniform([-8, -4, 0], [8, 4, 0], (count, 3))
     high = rng.random(count) < 0.4
     ground[high, :2] = (
-        rng.choice([-6.0, -2.0, 3.0, 7.0], (count, 1))[high] + rng.uniform(-0.5, 0.5, (count, 2))[high]
+        rng.choice([-6.0, -2.0, 3.0, 7.0], (count, 1))[high]
+        + rng.uniform(-0.5, 0.5, (count, 2))[high]
     )
     ground[high, 1] *= 0.3
     ground[high, 2] = rng.uniform(0, 1, count)[high]

@@ -92,11 +92,15 @@ def run_of(
     """outputs/…, trained from folder/data/poster."""
     run = folder / "outputs" / "poster" / "splatfacto" / "today"
     run.mkdir(parents=True)
-    settings = CONFIG.format(data=data, manager=manager, parser=parser, mode=mode, optimizer=optimizer)
+    settings = CONFIG.format(
+        data=data, manager=manager, parser=parser, mode=mode, optimizer=optimizer
+    )
     (run / "config.yml").write_text(settings)
     transform = (T @ A)[:3].tolist() if parser == "Nerfstudio" else T[:3].tolist()
     scale = SCALE * APPLIED if parser == "Nerfstudio" else SCALE
-    (run / "dataparser_transforms.json").write_text(json.dumps({"transform": transform, "scale": scale}))
+    (run / "dataparser_transforms.json").write_text(
+        json.dumps({"transform": transform, "scale": scale})
+    )
     return run
 
 

@@ -91,7 +91,15 @@ def transforms(path: Path, viewmats: list[np.ndarray], **extra: Any) -> Path:
         world = np.linalg.inv(view)
         world[:3, 1:3] *= -1
         frames.append({"file_path": f"images/{i:03d}.png", "transform_matrix": world.tolist()})
-    content = {"fl_x": 10.0, "fl_y": 11.0, "cx": 4.5, "cy": 2.5, "w": 8.0, "h": 6.0, "frames": frames} | extra
+    content = {
+        "fl_x": 10.0,
+        "fl_y": 11.0,
+        "cx": 4.5,
+        "cy": 2.5,
+        "w": 8.0,
+        "h": 6.0,
+        "frames": frames,
+    } | extra
     path.write_text(json.dumps({k: v for k, v in content.items() if v is not None}))
     return path
 
@@ -104,7 +112,9 @@ def edit(path: Path, change: Callable[[dict[str, Any]], Any]) -> None:
 
 def views(count: int, seed: int = 0, photos: Path | None = None) -> Cameras:
     rng = np.random.default_rng(seed)
-    Ks = [[[rng.uniform(1, 999), 0, rng.uniform(0, 9)], [0, rng.uniform(1, 999), 3.3], [0, 0, 1]]] * count
+    Ks = [
+        [[rng.uniform(1, 999), 0, rng.uniform(0, 9)], [0, rng.uniform(1, 999), 3.3], [0, 0, 1]]
+    ] * count
     return Cameras.from_lists(
         orbit(count),
         Ks,

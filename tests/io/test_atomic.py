@@ -24,8 +24,12 @@ def test_an_output_appears_whole(tmp_path: Path, folder: bool) -> None:
         part.parent.mkdir(exist_ok=True)
         part.write_text("new")
         assert not (tmp_path / "a.ply").exists()
-    assert [path.name for path in tmp_path.rglob("*")] == ["a.ply", "deep", "a"][: 3 if folder else 1]
-    with pytest.raises(OutputError, match="exists; overwrite=True" if not folder else "is a folder"):
+    assert [path.name for path in tmp_path.rglob("*")] == ["a.ply", "deep", "a"][
+        : 3 if folder else 1
+    ]
+    with pytest.raises(
+        OutputError, match="exists; overwrite=True" if not folder else "is a folder"
+    ):
         check_output(tmp_path / "a.ply")
     if not folder:
         with atomic_output(tmp_path / "a.ply", overwrite=True) as temporary:
@@ -47,8 +51,12 @@ def half_write(path: Path, error: BaseException, folder: bool = False) -> None:
 
 
 @pytest.mark.parametrize("folder", [False, True])
-@pytest.mark.parametrize("error", [ValueError(), KeyboardInterrupt(), OSError(28, "No space left on device")])
-def test_failure_leaves_nothing_and_the_old_file(tmp_path: Path, error: BaseException, folder: bool) -> None:
+@pytest.mark.parametrize(
+    "error", [ValueError(), KeyboardInterrupt(), OSError(28, "No space left on device")]
+)
+def test_failure_leaves_nothing_and_the_old_file(
+    tmp_path: Path, error: BaseException, folder: bool
+) -> None:
     (tmp_path / "a").write_text("old")
     with pytest.raises((ValueError, KeyboardInterrupt, OutputError)) as caught:
         half_write(tmp_path / ("b" if folder else "a"), error, folder)
@@ -91,7 +99,10 @@ def test_another_kind_in_the_way(tmp_path: Path) -> None:
     with pytest.raises(OutputError, match="is a folder"):
         check_output(tmp_path, overwrite=True)
     (tmp_path / "out").write_text("a file")
-    with pytest.raises(OutputError, match="is a file"), atomic_folder(tmp_path / "out", overwrite=True):
+    with (
+        pytest.raises(OutputError, match="is a file"),
+        atomic_folder(tmp_path / "out", overwrite=True),
+    ):
         pass
 
 

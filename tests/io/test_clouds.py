@@ -47,7 +47,9 @@ def test_all_zero_colors_are_told(tmp_path: Path, color: str) -> None:
         path = las(tmp_path / "a.las", positions, rgb)
     elif color == "points3D":
         path = tmp_path / "points3D.txt"
-        path.write_text("".join(f"{i} {x} {y} {z} 0 0 0 0.5\n" for i, (x, y, z) in enumerate(positions)))
+        path.write_text(
+            "".join(f"{i} {x} {y} {z} 0 0 0 0.5\n" for i, (x, y, z) in enumerate(positions))
+        )
     else:
         path = ply(tmp_path / "a.ply", columns("f4", color), np.c_[positions, rgb])
     found = read_cloud(path)
@@ -77,7 +79,12 @@ def test_degrees_beside_metres_are_told(
     if kind_ == "ply":
         path = ply(tmp_path / "a.ply", columns("f8", "u1"), np.c_[positions, rgb])
     else:
-        path = las(tmp_path / f"a.{kind_}", positions, 257 * rgb, scales=(spread * 1e-7, spread * 1e-7, 1e-3))
+        path = las(
+            tmp_path / f"a.{kind_}",
+            positions,
+            257 * rgb,
+            scales=(spread * 1e-7, spread * 1e-7, 1e-3),
+        )
     assert ["degrees" in n.code for n in read_cloud(path).notes] == [True] * expected
 
 
@@ -104,10 +111,15 @@ def test_offset_is_that_of_most_points(tmp_path: Path, name: str, low: float) ->
 @pytest.mark.parametrize("suffix", [".las", ".laz"])
 @pytest.mark.parametrize("version", [3, 7])
 def test_noise_is_dropped(tmp_path: Path, suffix: str, version: int) -> None:
-    positions, rgb = FAR + np.random.default_rng(0).normal(0, 50, (300, 3)), np.full((300, 3), 65535)
+    positions, rgb = (
+        FAR + np.random.default_rng(0).normal(0, 50, (300, 3)),
+        np.full((300, 3), 65535),
+    )
     classes = np.tile([2, 7, 18, 6, 1], 60)
     withheld = np.arange(300) % 10 == 3
-    path = las(tmp_path / f"a{suffix}", positions, rgb, version, classification=classes, withheld=withheld)
+    path = las(
+        tmp_path / f"a{suffix}", positions, rgb, version, classification=classes, withheld=withheld
+    )
     found, kept = read_cloud(path), ~np.isin(classes, (7, 18)) & ~withheld
     np.testing.assert_allclose(found.points.positions, positions[kept], atol=0.00051, rtol=0)
     assert [(n.code, n.count) for n in found.notes] == [("noise", np.count_nonzero(~kept))]
@@ -123,7 +135,9 @@ def test_ply_with_other_color_names(tmp_path: Path) -> None:
     np.testing.assert_allclose(points.colors, [[1, 0, 0.2]])
 
 
-@pytest.mark.parametrize("form", ["{}", "scalar_{}", "scal_{}", "scalar_scal_{}", "diffuse_{}", "Color_{}"])
+@pytest.mark.parametrize(
+    "form", ["{}", "scalar_{}", "scal_{}", "scalar_scal_{}", "diffuse_{}", "Color_{}"]
+)
 @pytest.mark.parametrize("word", ["Red Green Blue", "red green blue", "R G B", "r g b", "Rf Gf Bf"])
 def test_spellings_of_colours(tmp_path: Path, word: str, form: str) -> None:
     types = dict.fromkeys(map(form.format, word.split()), "f4")
@@ -151,7 +165,9 @@ def test_other_names_of_colours_are_told(tmp_path: Path) -> None:
 @pytest.mark.parametrize("faces", [3, 4])
 @pytest.mark.parametrize("texture", [(), ("s", "t"), ("texture_u", "texture_v")])
 @pytest.mark.parametrize("wanted", ["scene", "cloud"])
-def test_a_mesh_without_colours_is_named(tmp_path: Path, wanted: str, texture: tuple, faces: int) -> None:
+def test_a_mesh_without_colours_is_named(
+    tmp_path: Path, wanted: str, texture: tuple, faces: int
+) -> None:
     types = dict.fromkeys(["x", "y", "z", *texture], "f4")
     source = Source(ply(tmp_path / "a.ply", types, np.ones((4, len(types))), faces=faces))
     with pytest.raises(InputError, match=r"is a mesh.*sample points"):
@@ -246,7 +262,9 @@ def test_las(tmp_path: Path, suffix: str, top: int) -> None:
 STORED = ["las", "laz", "ply", "e57"]
 
 
-def stored(path: Path, positions: np.ndarray, rgb: np.ndarray | None, intensity: np.ndarray) -> Path:
+def stored(
+    path: Path, positions: np.ndarray, rgb: np.ndarray | None, intensity: np.ndarray
+) -> Path:
     """Write 16-bit colours, if any, and intensities in the format of the name."""
     if path.suffix in (".las", ".laz"):
         return las(path, positions, rgb, 3, intensity=intensity)
@@ -290,7 +308,9 @@ def test_intensities_are_grey_where_colors_are_missing_or_all_black(
 @pytest.mark.parametrize("bits", [8, 10, 12, 16])
 @pytest.mark.parametrize("strays", [0, 20])
 @pytest.mark.parametrize("suffix", STORED[:3])
-def test_the_range_of_colors_is_that_of_most(tmp_path: Path, suffix: str, strays: int, bits: int) -> None:
+def test_the_range_of_colors_is_that_of_most(
+    tmp_path: Path, suffix: str, strays: int, bits: int
+) -> None:
     """Black points do not count, and a note reports them."""
     rng = np.random.default_rng(1)
     unit = rng.uniform(0.02, 1, (3000, 3))
@@ -328,10 +348,15 @@ def test_a_cloud_of_nothing_moves_no_other(tmp_path: Path, rest: str, suffix: st
 @pytest.mark.parametrize("suffix", ["ply", "e57", "xyz", "pcd"])  # .las stores differences from FAR
 @pytest.mark.parametrize("at", [FAR, np.zeros(3)], ids=["far", "near"])
 @pytest.mark.parametrize("zeros", [1, 900])
-def test_points_without_a_return_are_dropped(tmp_path: Path, suffix: str, at: np.ndarray, zeros: int) -> None:
+def test_points_without_a_return_are_dropped(
+    tmp_path: Path, suffix: str, at: np.ndarray, zeros: int
+) -> None:
     """One point at 0 0 0 of a cloud about the origin may be a point."""
     rng = np.random.default_rng(0)
-    positions, rgb = at.round() + rng.normal(0, 9, (3000, 3)).round(3), rng.integers(1, 65535, (3000, 3))
+    positions, rgb = (
+        at.round() + rng.normal(0, 9, (3000, 3)).round(3),
+        rng.integers(1, 65535, (3000, 3)),
+    )
     lost = rng.permutation(3000) < zeros
     positions[lost] = 0
     path = tmp_path / f"a.{suffix}"
@@ -424,7 +449,9 @@ UTM = 'PROJCS["UTM {0}N",GEOGCS["W",AUTHORITY["EPSG","4326"]],UNIT["metre",1],AU
 def test_several_map_systems_are_refused(tmp_path: Path, a: tuple, b: tuple, several: bool) -> None:
     paths = [systems(tmp_path / "a.las", *a), systems(tmp_path / "b.las", *b)]
     if several:
-        with pytest.raises(InputError, match=r"a\.las: several map systems: a\.las in .*, b\.las in "):
+        with pytest.raises(
+            InputError, match=r"a\.las: several map systems: a\.las in .*, b\.las in "
+        ):
             stream_of(paths)
         return
     stream = stream_of(paths)
@@ -440,7 +467,11 @@ FEET = 'PROJCS["Oregon",GEOGCS["G",UNIT["degree",0.01745]],UNIT["{}",{}],AXIS["X
     [
         (None, FEET.format("US survey foot", 0.3048006096), 1200 / 3937),
         (None, f'COMPD_CS["x",{FEET.format("foot", 0.3048)},VERT_CS["h",UNIT["metre",1]]]', 0.3048),
-        (None, 'PROJCRS["A",CS[Cartesian,2],AXIS["(E)",east],LENGTHUNIT["metre",1],ID["EPSG",2056]]', 1.0),
+        (
+            None,
+            'PROJCRS["A",CS[Cartesian,2],AXIS["(E)",east],LENGTHUNIT["metre",1],ID["EPSG",2056]]',
+            1.0,
+        ),
         (9002, None, 0.3048),
         (None, None, None),
     ],
@@ -457,7 +488,9 @@ def test_the_unit_of_a_scan_is_its_map_system_s(
 @pytest.mark.parametrize("value", [0.0, np.nan, np.inf])
 @pytest.mark.parametrize("at", [131, 139, 147, 155])
 @pytest.mark.parametrize("suffix", ["las", "laz"])
-def test_a_broken_scale_or_offset_is_named(tmp_path: Path, suffix: str, at: int, value: float) -> None:
+def test_a_broken_scale_or_offset_is_named(
+    tmp_path: Path, suffix: str, at: int, value: float
+) -> None:
     path = las(tmp_path / f"a.{suffix}", np.arange(30.0).reshape(10, 3), np.ones((10, 3), int))
     data = bytearray(path.read_bytes())
     struct.pack_into("<d", data, at, value)
@@ -523,7 +556,9 @@ def test_more_points_than_its_chunks_hold(laz: Path) -> None:
     struct.pack_into("<I", data, 107, 10_000_000)
     struct.pack_into("<I", data, data.find(b"laszip encoded") - 2 + 54 + 12, 10_000_000)
     laz.write_bytes(data)
-    with pytest.raises(InputError, match=r"bytes would unpack to 260,000,000; the limit is 67,108,864"):
+    with pytest.raises(
+        InputError, match=r"bytes would unpack to 260,000,000; the limit is 67,108,864"
+    ):
         read_points(laz)
 
 
@@ -555,7 +590,9 @@ def test_a_panic_in_lazrs_is_one_line(laz: Path, monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(laspy.LasReader, "read_points", fall)
     with pytest.raises(InputError, match=r"a\.laz: cannot be read as LAS: divisor of zero"):
         read_points(laz)
-    monkeypatch.setattr(laspy.LasReader, "read_points", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+    monkeypatch.setattr(
+        laspy.LasReader, "read_points", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt)
+    )
     with pytest.raises(KeyboardInterrupt):
         read_points(laz)
 

@@ -82,7 +82,9 @@ def test_a_cut_column_is_named(tmp_path: Path, name: str, keep: int, fault: Faul
     ("name", "at", "fault"),
     [("cameras.bin", 8 + 24 + 8, ("PARAMS[1]", 0)), ("images.bin", 8 + 4 + 5 * 8, ("TY", 0))],
 )
-def test_a_binary_value_that_is_not_finite_is_named(tmp_path: Path, name: str, at: int, fault: Fault) -> None:
+def test_a_binary_value_that_is_not_finite_is_named(
+    tmp_path: Path, name: str, at: int, fault: Fault
+) -> None:
     folder = colmap(tmp_path / "project", orbit(1), text=False)
     path = folder / "sparse" / "0" / name
     data = bytearray(path.read_bytes())
@@ -128,7 +130,9 @@ def test_other_and_absent_cameras_are_rejected(tmp_path: Path) -> None:
         ("images", "1 1 0 0 0 0 0 4 7\n\n", ("NAME", 0)),
     ],
 )
-def test_a_bad_column_of_a_text_table_is_named(tmp_path: Path, name: str, text: str, fault: Fault) -> None:
+def test_a_bad_column_of_a_text_table_is_named(
+    tmp_path: Path, name: str, text: str, fault: Fault
+) -> None:
     folder = colmap(tmp_path / "project", orbit(2), text=True)
     path = folder / "sparse" / "0" / f"{name}.txt"
     path.write_text(text, encoding="utf-8")
@@ -172,7 +176,9 @@ def rig_model(folder: Path, text: bool) -> Path:
     rng, model, rig = np.random.default_rng(0), pycolmap.Reconstruction(), pycolmap.Rig(rig_id=5)
 
     def pose() -> object:
-        return pycolmap.Rigid3d(pycolmap.Rotation3d(quaternion(turn(rng))[[1, 2, 3, 0]]), rng.normal(size=3))
+        return pycolmap.Rigid3d(
+            pycolmap.Rotation3d(quaternion(turn(rng))[[1, 2, 3, 0]]), rng.normal(size=3)
+        )
 
     cameras = [
         pycolmap.Camera(model="PINHOLE", width=8, height=6, params=[9, 9, 4, 3], camera_id=i)
@@ -189,7 +195,9 @@ def rig_model(folder: Path, text: bool) -> Path:
             key = 20 + 10 * number + camera.camera_id
             name = f"cam{camera.camera_id}/{number}.png"
             images.append(
-                pycolmap.Image(name=name, camera_id=camera.camera_id, image_id=key, frame_id=10 + number)
+                pycolmap.Image(
+                    name=name, camera_id=camera.camera_id, image_id=key, frame_id=10 + number
+                )
             )
             frame.add_data_id(images[-1].data_id)
         frame.rig_from_world = pose()

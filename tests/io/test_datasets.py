@@ -20,7 +20,16 @@ def test_matrix_citys_pose_folder_states_its_splits(tmp_path: Path) -> None:
     pose = tmp_path / "aerial" / "pose" / "block_A"
     pose.mkdir(parents=True)
     head = {"camera_angle_x": 0.7853981633974483, "camera_angle_y": 0.4735, "w": 192, "h": 108}
-    head |= {"fl_x": 231.8, "fl_y": 231.8, "cx": 96.0, "cy": 54.0, "k1": 0, "k2": 0, "p1": 0, "p2": 0}
+    head |= {
+        "fl_x": 231.8,
+        "fl_y": 231.8,
+        "cx": 96.0,
+        "cy": 54.0,
+        "k1": 0,
+        "k2": 0,
+        "p1": 0,
+        "p2": 0,
+    }
     for split, rows in (("train", range(6)), ("test", range(6, 9))):
         block = "block_1" if split == "train" else "block_1_test"
         frames = []
@@ -96,7 +105,8 @@ def test_polycam(folder: str, notes: list[str], tmp_path: Path) -> None:
     found = io.read_view_set(tmp_path)
     np.testing.assert_allclose(found.cameras.viewmats, POSES, atol=1e-9)
     np.testing.assert_allclose(found.cameras.Ks[0], [[95, 0, 51], [0, 96, 37], [0, 0, 1]])
-    assert found.cameras.names[:3] == ("9999000.jpg", "9999500.jpg", "10000000.jpg")  # in order of time
+    # in order of time
+    assert found.cameras.names[:3] == ("9999000.jpg", "9999500.jpg", "10000000.jpg")
     assert [note.code for note in found.notes] == notes
     file = next((tmp_path / "keyframes").glob("*cameras/*.json"))
     file.write_text("{}")
@@ -105,7 +115,9 @@ def test_polycam(folder: str, notes: list[str], tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("key", ["K", "intrinsics"])
-def test_a_frame_may_carry_its_matrix_and_photos_may_lie_beside_the_file(key: str, tmp_path: Path) -> None:
+def test_a_frame_may_carry_its_matrix_and_photos_may_lie_beside_the_file(
+    key: str, tmp_path: Path
+) -> None:
     frames = []
     for i, view in enumerate(POSES):
         K = [[90.0 + i, 0, 50], [0, 91, 40], [0, 0, 1]]
@@ -129,7 +141,8 @@ def test_a_colmap_model_without_a_table_says_which(part: str, tmp_path: Path) ->
     (tmp_path / part).unlink()
     for path in (tmp_path, tmp_path / "sparse" / "0"):
         with pytest.raises(
-            InputError, match=f"COLMAP model without {Path(part).name}; found .*copy the whole model"
+            InputError,
+            match=f"COLMAP model without {Path(part).name}; found .*copy the whole model",
         ):
             io.read_views(path)
 

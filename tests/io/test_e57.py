@@ -19,11 +19,14 @@ PLACE = np.array([500_000.0, 4_000_000.0, 30.0])
 def scan(seed: int, count: int = 500) -> dict[str, np.ndarray]:
     rng = np.random.default_rng(seed)
     place = {
-        f"cartesian{axis}": values for axis, values in zip("XYZ", rng.normal(0, 5, (3, count)), strict=True)
+        f"cartesian{axis}": values
+        for axis, values in zip("XYZ", rng.normal(0, 5, (3, count)), strict=True)
     }
     colors = {
         f"color{name}": values
-        for name, values in zip(("Red", "Green", "Blue"), rng.integers(0, 256, (3, count)), strict=True)
+        for name, values in zip(
+            ("Red", "Green", "Blue"), rng.integers(0, 256, (3, count)), strict=True
+        )
     }
     return place | colors
 
@@ -46,7 +49,9 @@ def test_scans_are_joined_by_their_poses(tmp_path: Path, count: int) -> None:
     found, at = read_cloud(path), np.concatenate([xyz(s) for s in scans])
     turned = np.stack([-at[:, 1], at[:, 0], at[:, 2]], 1) + PLACE
     np.testing.assert_allclose(found.points.positions, turned, atol=1e-5, rtol=0)
-    rgb = np.concatenate([np.stack([s[f"color{c}"] for c in ("Red", "Green", "Blue")], 1) for s in scans])
+    rgb = np.concatenate(
+        [np.stack([s[f"color{c}"] for c in ("Red", "Green", "Blue")], 1) for s in scans]
+    )
     np.testing.assert_allclose(found.points.colors, rgb / 255, atol=1e-6)
     assert (found.notes, kind(path)) == ((), "points")
 
@@ -58,7 +63,9 @@ def test_blocks_begin_at_any_row(tmp_path: Path, rows: int, start: int) -> None:
     blocks = list(stream_of(path).blocks(rows, start))
     assert max(len(positions) for positions, _ in blocks) <= rows
     np.testing.assert_array_equal(np.concatenate([p for p, _ in blocks]), whole.positions[start:])
-    np.testing.assert_allclose(np.concatenate([c for _, c in blocks]), whole.colors[start:], atol=1e-6)
+    np.testing.assert_allclose(
+        np.concatenate([c for _, c in blocks]), whole.colors[start:], atol=1e-6
+    )
 
 
 def test_intensities_are_grey_between_their_limits(tmp_path: Path) -> None:
@@ -91,7 +98,9 @@ def raw_scans(path: Path, *scans: dict[str, np.ndarray]) -> Path:
             node.set("points", points)
             file.data3d.append(node)
             buffers = libe57.VectorSourceDestBuffer()
-            kept = {name: np.ascontiguousarray(values, np.float64) for name, values in fields.items()}
+            kept = {
+                name: np.ascontiguousarray(values, np.float64) for name, values in fields.items()
+            }
             for name, column in kept.items():
                 buffers.append(libe57.SourceDestBuffer(image, name, column, count, True, True))
             writer = points.writer(buffers)
@@ -153,7 +162,9 @@ def test_each_scan_has_its_own_range(tmp_path: Path) -> None:
     place = {name: values for name, values in grey.items() if name.startswith("cartesian")}
     values = np.random.default_rng(3).uniform(50, 1000, 2000)
     values[7] = 1e6
-    found = read_cloud(raw_scans(tmp_path / "a.e57", byte, word | deep, place | {"intensity": values}))
+    found = read_cloud(
+        raw_scans(tmp_path / "a.e57", byte, word | deep, place | {"intensity": values})
+    )
     rgb = [np.stack([s[f"color{c}"] for c in ("Red", "Green", "Blue")], 1) for s in (byte, word)]
     np.testing.assert_allclose(found.points.colors[:4000], np.concatenate(rgb) / 255, atol=1e-6)
     shades = found.points.colors[4000:, 0]

@@ -42,7 +42,12 @@ def ways(kind: str) -> np.ndarray:
     v, u = np.mgrid[0:height, 0:width] + 0.5
     if kind == "pinhole":
         return np.stack(
-            [(u - MIDDLE[0]) * PIXEL[0] / FOCAL, -(v - MIDDLE[1]) * PIXEL[1] / FOCAL, -np.ones_like(u)], -1
+            [
+                (u - MIDDLE[0]) * PIXEL[0] / FOCAL,
+                -(v - MIDDLE[1]) * PIXEL[1] / FOCAL,
+                -np.ones_like(u),
+            ],
+            -1,
         )
     around, up = 2 * np.pi * (0.5 - u / width), np.pi * (0.5 - v / height)
     return np.stack([np.cos(up) * np.cos(around), np.cos(up) * np.sin(around), np.sin(up)], -1)
@@ -83,7 +88,10 @@ def written(path: Path, *photos: dict) -> Path:
             shown.set("pngImage" if format == "PNG" else "jpegImage", bytes_of[-1][0])
             if photo.get("mask"):
                 bytes_of.append(
-                    blob(image, np.repeat(np.arange(width) < width / 2, height).reshape(width, height).T)
+                    blob(
+                        image,
+                        np.repeat(np.arange(width) < width / 2, height).reshape(width, height).T,
+                    )
                 )
                 shown.set("imageMask", bytes_of[-1][0])
             shown.set("imageWidth", libe57.IntegerNode(image, width))
@@ -107,12 +115,19 @@ def written(path: Path, *photos: dict) -> Path:
 def posed(kind: str, seed: int, **more: object) -> dict:
     rng = np.random.default_rng(seed)
     quat = rng.normal(size=4)
-    return {"kind": kind, "quat": quat / np.linalg.norm(quat), "shift": rng.normal(size=3) * 10, **more}
+    return {
+        "kind": kind,
+        "quat": quat / np.linalg.norm(quat),
+        "shift": rng.normal(size=3) * 10,
+        **more,
+    }
 
 
 @pytest.mark.parametrize("kinds", [["spherical"], ["pinhole"], ["pinhole", "spherical", "pinhole"]])
 @pytest.mark.parametrize("format", ["PNG", "JPEG"])
-def test_views_show_what_lies_in_their_directions(tmp_path: Path, kinds: list[str], format: str) -> None:
+def test_views_show_what_lies_in_their_directions(
+    tmp_path: Path, kinds: list[str], format: str
+) -> None:
     photos = [posed(kind, seed, format=format) for seed, kind in enumerate(kinds)]
     path = written(tmp_path / "a b.e57", *photos)
     views = read_views(path)
@@ -123,7 +138,9 @@ def test_views_show_what_lies_in_their_directions(tmp_path: Path, kinds: list[st
         v, u = np.mgrid[0 : view.height, 0 : view.width] + 0.5
         local = np.stack([u, v, np.ones_like(u)], -1) @ np.linalg.inv(view.K).T
         expected = pattern(local @ view.viewmat[:3, :3])
-        assert np.abs(load_photo(views, i)[0] - expected).mean() < (0.01 if format == "PNG" else 0.02)
+        assert np.abs(load_photo(views, i)[0] - expected).mean() < (
+            0.01 if format == "PNG" else 0.02
+        )
 
 
 @pytest.mark.parametrize("without", ["rotation", "translation"])
@@ -172,13 +189,17 @@ def test_photos_that_are_no_views_are_named(tmp_path: Path, what: str) -> None:
 def test_a_scan_without_photos_and_notes(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"a\.e57: holds no photos"):
         read_views(written(tmp_path / "a.e57"))
-    notes = read_cloud(written(tmp_path / "b.e57", posed("spherical", 0), posed("pinhole", 1))).notes
+    notes = read_cloud(
+        written(tmp_path / "b.e57", posed("spherical", 0), posed("pinhole", 1))
+    ).notes
     assert [(note.code, note.count) for note in notes] == [("photos", 2)]
     with pytest.raises(InputError, match="photos inside"):
         read_views(tmp_path / "b.e57", images=tmp_path)
 
 
-def test_a_scan_and_its_panoramas_distil_from_one_command(tmp_path: Path, command_line: CommandLine) -> None:
+def test_a_scan_and_its_panoramas_distil_from_one_command(
+    tmp_path: Path, command_line: CommandLine
+) -> None:
     written(tmp_path / "a.e57", *[posed("spherical", k) for k in range(3)])
     ask = ("--views", "a.e57", "--photos", "-n", 9, "--steps", 3, "--size", 40, "-o", "run")
     succeeds(command_line, tmp_path, "distill", "a.e57", *ask)
@@ -186,7 +207,9 @@ def test_a_scan_and_its_panoramas_distil_from_one_command(tmp_path: Path, comman
 
 
 @pytest.mark.parametrize("home", ["file", "none"])
-def test_a_home_that_cannot_be_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, home: str) -> None:
+def test_a_home_that_cannot_be_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, home: str
+) -> None:
     path = written(tmp_path / "a.e57", posed("pinhole", 0))
     monkeypatch.delenv("XDG_CACHE_HOME")
     monkeypatch.setattr("tempfile.gettempdir", lambda: str(tmp_path / "temporary"))
@@ -194,7 +217,9 @@ def test_a_home_that_cannot_be_written(tmp_path: Path, monkeypatch: pytest.Monke
     if home == "file":
         monkeypatch.setattr(Path, "home", lambda: tmp_path / "home")
     else:
-        monkeypatch.setattr(Path, "home", classmethod(lambda _: (_ for _ in ()).throw(RuntimeError)))
+        monkeypatch.setattr(
+            Path, "home", classmethod(lambda _: (_ for _ in ()).throw(RuntimeError))
+        )
     (photo,) = read_views(path).image_paths
     assert photo is not None
     assert photo.is_relative_to(tmp_path / "temporary" / "g2ard")

@@ -83,7 +83,8 @@ def test_names_that_nothing_matches_can_be_printed(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("beside", "spelling"), [(False, name) for name in _MASKS] + [(True, name) for name in _MASKS_BESIDE]
+    ("beside", "spelling"),
+    [(False, name) for name in _MASKS] + [(True, name) for name in _MASKS_BESIDE],
 )
 @pytest.mark.parametrize("suffix", [".png", ".jpg", ".PNG"])
 def test_masks_in_every_spelling(tmp_path: Path, beside: bool, spelling: str, suffix: str) -> None:
@@ -113,7 +114,8 @@ def test_views_take_the_size_of_their_photos(tmp_path: Path) -> None:
     whole = read_view_set(tmp_path).cameras
     width, height = int(whole.widths[0]), int(whole.heights[0])
     for i, name in enumerate(NAMES):
-        size = (width // 2, height // 2) if i < 3 else (width, height * 2)  # the last is another photo
+        # the last is another photo
+        size = (width // 2, height // 2) if i < 3 else (width, height * 2)
         photo(tmp_path / "images" / name, size)
     found = read_view_set(tmp_path)
     assert found.cameras.widths.tolist() == [width // 2] * 3 + [width]
@@ -153,7 +155,9 @@ def test_poses_of_rigs_win_over_stale_ones(tmp_path: Path) -> None:
 def test_observations_that_are_not_numbers(tmp_path: Path, value: str) -> None:
     colmap(tmp_path, orbit(4), text=True)
     table = tmp_path / "sparse" / "0" / "images.txt"
-    lines = [line for line in table.read_text().splitlines() if line.strip() and not line.startswith("#")]
+    lines = [
+        line for line in table.read_text().splitlines() if line.strip() and not line.startswith("#")
+    ]
     rows = [line for line in lines if line.endswith(".png")]
     table.write_text("".join(f"{row}\n12.5 30.25 17 {value} {value} -1\n" for row in rows))
     assert len(read_view_set(tmp_path).cameras) == 4

@@ -53,7 +53,9 @@ def gsplat_pngs(folder: Path, names: list[str], extra: dict) -> None:
         (["means", "scales", "quats", "opacities", "sh0", "shN"], {"quantization": 6}),
     ],
 )
-def test_pngs_of_gsplat(tmp_path: Path, given: str, name: str, names: list[str], extra: dict) -> None:
+def test_pngs_of_gsplat(
+    tmp_path: Path, given: str, name: str, names: list[str], extra: dict
+) -> None:
     gsplat_pngs(tmp_path / name, names, extra)
     with pytest.raises(InputError, match="gsplat"):
         read_scene(tmp_path / name / given)
@@ -62,7 +64,9 @@ def test_pngs_of_gsplat(tmp_path: Path, given: str, name: str, names: list[str],
 def sample(sign: Sign) -> tuple[str, bytes]:
     """Return the name and the content of a file of this kind, made from its row."""
     name = sign.names.split()[0].replace("*", "a")
-    content = b"\0\7" if sign.names != "*" and not (sign.starts or sign.words) else b" ".join(sign.words)
+    content = (
+        b"\0\7" if sign.names != "*" and not (sign.starts or sign.words) else b" ".join(sign.words)
+    )
     if sign.words and sign.words[0].startswith(b"numbers:"):
         times = [
             f"{i} 2 3 4 0 0 0 1" if b"unit" in sign.words[0] else f"1 0 0 {i} 0 1 0 3 0 0 1 4"
@@ -77,7 +81,9 @@ def sample(sign: Sign) -> tuple[str, bytes]:
         return name, packed.getvalue()
     if sign.starts == (b"\x1f\x8b",):
         return name, gzip.compress(content)
-    return name, bytes(sign.at) + (sign.starts[0] if sign.starts else b"") + b" " * bool(content) + content
+    return name, bytes(sign.at) + (sign.starts[0] if sign.starts else b"") + b" " * bool(
+        content
+    ) + content
 
 
 @pytest.mark.parametrize("sign", SIGNS, ids=lambda sign: f"{sign.what} {sign.names}"[:60])
@@ -96,7 +102,9 @@ def test_every_kind_is_told_from_its_row(tmp_path: Path, sign: Sign) -> None:
         assert "estimate them with" not in str(caught.value)
 
 
-@pytest.mark.parametrize("sign", [sign for sign in SIGNS if sign.poses], ids=lambda sign: sign.what[:60])
+@pytest.mark.parametrize(
+    "sign", [sign for sign in SIGNS if sign.poses], ids=lambda sign: sign.what[:60]
+)
 def test_poses_beside_photos_are_named(tmp_path: Path, sign: Sign) -> None:
     name, content = sample(sign)
     (tmp_path / "images").mkdir()
@@ -110,9 +118,7 @@ def test_poses_beside_photos_are_named(tmp_path: Path, sign: Sign) -> None:
 
 POINTER = b"version https://git-lfs.github.com/spec/v1\noid sha256:0123\nsize 15600213\n"
 NAMES = "a.ply a.splat a.ksplat a.spz a.sog a.glb a.gltf a.usdc a.las a.laz a.e57 a.pcd a.xyz a.txt a.json"
-TABLES = (
-    "meta.json cameras.bin images.bin points3D.bin cameras.json transforms.json poses_bounds.npy config.yml"
-)
+TABLES = "meta.json cameras.bin images.bin points3D.bin cameras.json transforms.json poses_bounds.npy config.yml"
 
 
 @pytest.mark.parametrize("name", f"{NAMES} {TABLES}".split())
@@ -130,7 +136,9 @@ def test_pointers_beside_the_given_file(tmp_path: Path) -> None:
         read_view_set(tmp_path)
 
 
-@pytest.mark.parametrize("sign", [sign for sign in SIGNS if sign.reads], ids=lambda sign: sign.reads)
+@pytest.mark.parametrize(
+    "sign", [sign for sign in SIGNS if sign.reads], ids=lambda sign: sign.reads
+)
 def test_a_splat_of_another_format_is_named(tmp_path: Path, sign: Sign) -> None:
     content = sample(sign)[1]
     (tmp_path / "a.splat").write_bytes(content + bytes(-len(content) % 32))
@@ -157,7 +165,8 @@ def as_text(data: bytes) -> bytes:
 
 
 @pytest.mark.parametrize(
-    "name", ["a.ply", "a.compressed.ply", "a.splat", "a.spz", "a.sog", "a.glb", "a.las", "a.laz", "a.pcd"]
+    "name",
+    ["a.ply", "a.compressed.ply", "a.splat", "a.spz", "a.sog", "a.glb", "a.las", "a.laz", "a.pcd"],
 )
 def test_files_that_a_transfer_changed_are_refused(tmp_path: Path, name: str) -> None:
     truth, path = scene(3000, 0), tmp_path / name
@@ -203,7 +212,9 @@ def test_unknown_suffixes_of_known_content(tmp_path: Path, suffix: str) -> None:
 
 def test_a_photo_is_not_to_be_renamed_to_its_own_name(tmp_path: Path) -> None:
     Image.new("RGB", (8, 6)).save(tmp_path / "a.jpg")
-    with pytest.raises(InputError, match=r"unknown format '\.jpg' \(scenes: \.ply, \.compressed\.ply, "):
+    with pytest.raises(
+        InputError, match=r"unknown format '\.jpg' \(scenes: \.ply, \.compressed\.ply, "
+    ):
         kind(tmp_path / "a.jpg")
 
 

@@ -76,7 +76,8 @@ BESIDE = ("KHR_spz_gaussian_splats_compression", "KHR_spz_compression")
 
 
 @pytest.mark.parametrize(
-    ("name", "alone"), [*((name, False) for name in INSIDE + BESIDE), *((name, True) for name in BESIDE)]
+    ("name", "alone"),
+    [*((name, False) for name in INSIDE + BESIDE), *((name, True) for name in BESIDE)],
 )
 @pytest.mark.parametrize("degree", [0, 3])
 def test_earlier_names_of_an_spz(tmp_path: Path, name: str, alone: bool, degree: int) -> None:
@@ -92,7 +93,9 @@ def test_earlier_names_of_an_spz(tmp_path: Path, name: str, alone: bool, degree:
     np.testing.assert_array_equal(found.shN, wanted.shN)
 
 
-@pytest.mark.parametrize("name", ["CESIUM_gaussian_splatting", "EXT_spz_3", f"{EXTENSION}_of_tomorrow"])
+@pytest.mark.parametrize(
+    "name", ["CESIUM_gaussian_splatting", "EXT_spz_3", f"{EXTENSION}_of_tomorrow"]
+)
 @pytest.mark.parametrize("alone", [True, False])
 def test_other_extensions_of_splats_are_named(tmp_path: Path, name: str, alone: bool) -> None:
     document, binary = parts_of(tmp_path, scene())
@@ -161,7 +164,9 @@ def test_only_the_shown_scene_is_read(tmp_path: Path, scene_index: int | None) -
     found = read_splats(write_glb(tmp_path / "a.glb", document, binary))
     assert len(found) == len(scene())
     shift = 9.0 if scene_index else 0.0
-    np.testing.assert_allclose((found.means + found.offset)[:, 0], scene().means[:, 0] + shift, atol=1e-5)
+    np.testing.assert_allclose(
+        (found.means + found.offset)[:, 0], scene().means[:, 0] + shift, atol=1e-5
+    )
 
 
 @pytest.mark.parametrize("space", ["BT.709-linear", "lin_rec709_display", "srgb_rec709_display"])
@@ -172,9 +177,13 @@ def test_linear_colours_are_noted(tmp_path: Path, space: str) -> None:
     assert [note.code for note in notes] == ["linear_colors"] * ("lin" in space)
 
 
-@pytest.mark.parametrize(("mode", "says"), [(0, "holds points"), (4, "holds a mesh"), (None, "holds a mesh")])
+@pytest.mark.parametrize(
+    ("mode", "says"), [(0, "holds points"), (4, "holds a mesh"), (None, "holds a mesh")]
+)
 @pytest.mark.parametrize("wanted", ["scene", "cloud"])
-def test_meshes_and_points_are_named(tmp_path: Path, wanted: str, mode: int | None, says: str) -> None:
+def test_meshes_and_points_are_named(
+    tmp_path: Path, wanted: str, mode: int | None, says: str
+) -> None:
     document, binary = parts_of(tmp_path, scene(4, 0))
     (primitive,) = document["meshes"][0]["primitives"]
     del primitive["extensions"], primitive["mode"]

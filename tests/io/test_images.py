@@ -36,10 +36,15 @@ def save(path: Path, array: np.ndarray, **options: object) -> Path:
 
 @pytest.mark.parametrize("size", [(28, 21), (12, 9), (4, 3)])
 def test_shrinking_takes_the_mean_of_the_area(tmp_path: Path, size: tuple[int, int]) -> None:
-    pixels, (width, height) = np.random.default_rng(2).integers(0, 256, (21, 28, 3), dtype=np.uint8), size
+    pixels, (width, height) = (
+        np.random.default_rng(2).integers(0, 256, (21, 28, 3), dtype=np.uint8),
+        size,
+    )
     image = load_photo(camera(save(tmp_path / "a.png", pixels), size), 0)[0]
     fine = np.repeat(np.repeat(pixels / 255, height, axis=0), width, axis=1)  # both grids divide it
-    np.testing.assert_allclose(image, fine.reshape(height, 21, width, 28, 3).mean((1, 3)), atol=1e-6)
+    np.testing.assert_allclose(
+        image, fine.reshape(height, 21, width, 28, 3).mean((1, 3)), atol=1e-6
+    )
     assert (image.dtype, image.flags.c_contiguous) == (np.float32, True)
 
 
@@ -121,7 +126,9 @@ def test_photos_that_cannot_be_loaded_are_named(tmp_path: Path) -> None:
     (tmp_path / "a.png").write_bytes(b"not an image")
     with pytest.raises(InputError, match=r"a\.png: is not an image"):
         load_photo(camera(tmp_path / "a.png", (4, 4)), 0)
-    path = save(tmp_path / "b.png", np.random.default_rng(0).integers(0, 255, (64, 64, 3), dtype=np.uint8))
+    path = save(
+        tmp_path / "b.png", np.random.default_rng(0).integers(0, 255, (64, 64, 3), dtype=np.uint8)
+    )
     path.write_bytes(path.read_bytes()[:500])
     with pytest.raises(InputError, match=r"b\.png: cannot be decoded"):
         load_photo(camera(path, (64, 64)), 0)
@@ -209,11 +216,16 @@ def words_png(words: np.ndarray) -> bytes:
     raw = b"".join(b"\0" + row.astype(">u2").tobytes() for row in words)
 
     def chunk(name: bytes, data: bytes) -> bytes:
-        return struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
+        return (
+            struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
+        )
 
     head = struct.pack(">IIBBBBB", width, height, 16, {1: 0, 2: 4, 3: 2, 4: 6}[channels], 0, 0, 0)
     return (
-        b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", zlib.compress(raw)) + chunk(b"IEND", b"")
+        b"\x89PNG\r\n\x1a\n"
+        + chunk(b"IHDR", head)
+        + chunk(b"IDAT", zlib.compress(raw))
+        + chunk(b"IEND", b"")
     )
 
 
@@ -221,7 +233,13 @@ def words_tiff(words: np.ndarray) -> bytes:
     """Return an uncompressed TIFF of (H, W, C) values of 16 bits or more, or floats."""
     height, width, channels = words.shape
     sample = {"u": 1, "i": 2, "f": 3}[words.dtype.kind]
-    numbers = {256: width, 257: height, 258: 8 * words.itemsize, 259: 1, 262: 2 if channels > 2 else 1}
+    numbers = {
+        256: width,
+        257: height,
+        258: 8 * words.itemsize,
+        259: 1,
+        262: 2 if channels > 2 else 1,
+    }
     numbers |= {273: 150 + 2 * channels, 277: channels, 278: height, 279: words.nbytes, 339: sample}
     if channels > 3:
         numbers[338] = 0
@@ -280,7 +298,9 @@ def test_a_photo_brighter_than_its_folder_keeps_its_own_range(tmp_path: Path) ->
         (tmp_path / f"{k}.png").write_bytes(
             words_png(np.full((4, 4, 3), 900 if k != 1 else 60000) + np.arange(3))
         )
-    assert load_photo(camera(tmp_path / "1.png", (4, 4)), 0)[0][0, 0, 0] == pytest.approx(60000 / 65535)
+    assert load_photo(camera(tmp_path / "1.png", (4, 4)), 0)[0][0, 0, 0] == pytest.approx(
+        60000 / 65535
+    )
 
 
 @pytest.mark.parametrize(
@@ -297,11 +317,21 @@ def test_tiffs_that_cannot_be_read_say_so(tmp_path: Path, channels: int, kind: s
 
 
 PRIMARIES = {
-    "Display P3": ((0.51512, 0.2412, -0.00105), (0.29198, 0.69225, 0.04189), (0.1571, 0.06657, 0.78407)),
-    "Adobe RGB": ((0.60974, 0.31111, 0.01947), (0.20528, 0.62567, 0.06087), (0.14919, 0.06322, 0.74457)),
+    "Display P3": (
+        (0.51512, 0.2412, -0.00105),
+        (0.29198, 0.69225, 0.04189),
+        (0.1571, 0.06657, 0.78407),
+    ),
+    "Adobe RGB": (
+        (0.60974, 0.31111, 0.01947),
+        (0.20528, 0.62567, 0.06087),
+        (0.14919, 0.06322, 0.74457),
+    ),
     "ProPhoto": ((0.79767, 0.28804, 0.0), (0.13519, 0.71188, 0.0), (0.0313, 0.00009, 0.8249)),
 }
-SRGB = np.array([(0.43607, 0.22249, 0.01392), (0.38515, 0.71687, 0.09708), (0.14307, 0.06061, 0.7141)]).T
+SRGB = np.array(
+    [(0.43607, 0.22249, 0.01392), (0.38515, 0.71687, 0.09708), (0.14307, 0.06061, 0.7141)]
+).T
 
 
 def profile(primaries: tuple, name: bytes) -> bytes:
@@ -320,9 +350,9 @@ def profile(primaries: tuple, name: bytes) -> bytes:
         table += tag + struct.pack(">II", 132 + 12 * len(tags) + len(body), len(value))
         body += value + bytes(-len(value) % 4)
     size = 132 + len(table) + len(body)
-    head = struct.pack(">I4xI4s4s4s12x4s", size, 0x02100000, b"mntr", b"RGB ", b"XYZ ", b"acsp").ljust(
-        68, b"\0"
-    )
+    head = struct.pack(
+        ">I4xI4s4s4s12x4s", size, 0x02100000, b"mntr", b"RGB ", b"XYZ ", b"acsp"
+    ).ljust(68, b"\0")
     white = struct.pack(">iii", *(round(v * 65536) for v in (0.9642, 1.0, 0.8249)))
     return (head + white).ljust(128, b"\0") + struct.pack(">I", len(tags)) + table + body
 
@@ -337,16 +367,18 @@ def in_space(primaries: tuple, true: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("suffix", [".png", ".tif"])
 def test_wide_colour_spaces_become_srgb(tmp_path: Path, suffix: str, kind: str, space: str) -> None:
     true = np.repeat(np.random.default_rng(1).uniform(0.05, 0.95, (1, 8, 3)), 6, 0)
-    image = Image.fromarray(np.rint(255 * in_space(PRIMARIES[space], true)).astype(np.uint8)).convert(
-        kind, palette=Image.Palette.ADAPTIVE
-    )
+    image = Image.fromarray(
+        np.rint(255 * in_space(PRIMARIES[space], true)).astype(np.uint8)
+    ).convert(kind, palette=Image.Palette.ADAPTIVE)
     image.save(tmp_path / f"a{suffix}", icc_profile=profile(PRIMARIES[space], b"wide"))
     got = load_photo(camera(tmp_path / f"a{suffix}", (8, 6)), 0)[0]
     np.testing.assert_allclose(got, true, atol=0.05)
     assert np.abs(got - true).mean() < 0.008
 
 
-@pytest.mark.parametrize("content", [b"", b"broken", profile(PRIMARIES["ProPhoto"], b"my sRGB")[:300]])
+@pytest.mark.parametrize(
+    "content", [b"", b"broken", profile(PRIMARIES["ProPhoto"], b"my sRGB")[:300]]
+)
 def test_a_broken_profile_is_ignored(tmp_path: Path, content: bytes) -> None:
     Image.new("RGB", (8, 6), (51, 102, 204)).save(tmp_path / "a.png", icc_profile=content)
     got = load_photo(camera(tmp_path / "a.png", (8, 6)), 0)[0]
@@ -387,7 +419,9 @@ def in_alpha(mask: np.ndarray, shade: int) -> Image.Image:
     ids=lambda pair: pair[0],
 )  # fmt: skip
 @pytest.mark.parametrize("suffix", [".png", ".tif"])
-def test_masks_as_programs_write_them(tmp_path: Path, suffix: str, written: tuple[str, Callable]) -> None:
+def test_masks_as_programs_write_them(
+    tmp_path: Path, suffix: str, written: tuple[str, Callable]
+) -> None:
     kept = np.zeros((6, 8), bool)
     kept[:, :5] = True
     Image.new("RGB", (8, 6)).save(tmp_path / "a.png")

@@ -75,7 +75,9 @@ def test_activated_values_in_a_ply_are_noted(
 ) -> None:
     read = judge_storage(scales, opacities, base, logs=True)
     text = " ".join(note.text for note in read.notes)
-    assert [word for word in ("scales", "opacities", "base colours") if f"{word} (" in text] == words
+    assert [
+        word for word in ("scales", "opacities", "base colours") if f"{word} (" in text
+    ] == words
     assert (read.log_scales, read.opaque, read.white) == (True, None, None)
 
 
@@ -110,9 +112,17 @@ def test_black_tells_nothing_of_white() -> None:
 
 @pytest.mark.parametrize(
     ("low", "high", "logits"),
-    [(0.1, 1.05, False), (0.1, 1.2, True), (-0.05, 0.9, False), (-0.2, 0.9, True), (-7.0, -1.0, True)],
+    [
+        (0.1, 1.05, False),
+        (0.1, 1.2, True),
+        (-0.05, 0.9, False),
+        (-0.2, 0.9, True),
+        (-7.0, -1.0, True),
+    ],
 )
-def test_linear_opacities_are_logits_if_they_leave_their_range(low: float, high: float, logits: bool) -> None:
+def test_linear_opacities_are_logits_if_they_leave_their_range(
+    low: float, high: float, logits: bool
+) -> None:
     """A tenth beyond 0 or 1 is noise."""
     read = judge_storage(SCALES, np.linspace(low, high, COUNT), BASE, logs=False)
     assert (read.opaque is None) == logits

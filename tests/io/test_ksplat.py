@@ -21,7 +21,9 @@ from helpers.scenes import assert_same_bits
         ("level2-sh2", 2, 2 / 32767, 1e-3, 2 / 255),
     ],
 )
-def test_ksplat(name: str, degree: int, place: float, size: float, harmonics: float, tmp_path: Path) -> None:
+def test_ksplat(
+    name: str, degree: int, place: float, size: float, harmonics: float, tmp_path: Path
+) -> None:
     path, scene = unpacked_ksplat(name, tmp_path), truth(60, 3)
     assert kind(path) == "splats"
     found = read_scene(path).splats

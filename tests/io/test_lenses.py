@@ -83,7 +83,9 @@ def panorama(width: int) -> np.ndarray:
     """nerfstudio's equirectangular photo: the middle looks ahead, right is right, the top is up."""
     v, u = (np.mgrid[0 : width // 2, 0:width] + 0.5) / width
     around, down = 2 * np.pi * (u - 0.5), 2 * np.pi * (v - 0.25)
-    return pattern(np.stack([np.sin(around) * np.cos(down), np.sin(down), np.cos(around) * np.cos(down)], -1))
+    return pattern(
+        np.stack([np.sin(around) * np.cos(down), np.sin(down), np.cos(around) * np.cos(down)], -1)
+    )
 
 
 def fisheye(width: int, focal: float) -> np.ndarray:
@@ -99,10 +101,14 @@ def captured(folder: Path, image: np.ndarray, count: int = 9, **top: object) -> 
     path = transforms(folder / "transforms.json", orbit(count), **top)
     (folder / "images").mkdir(exist_ok=True)
     for i in range(count):
-        Image.fromarray(np.rint(image * 255).astype(np.uint8)).save(folder / "images" / f"{i:03d}.png")
+        Image.fromarray(np.rint(image * 255).astype(np.uint8)).save(
+            folder / "images" / f"{i:03d}.png"
+        )
     edit(
         path,
-        lambda c: [frame.update(file_path=f"images/{i:03d}.png") for i, frame in enumerate(c["frames"])],
+        lambda c: [
+            frame.update(file_path=f"images/{i:03d}.png") for i, frame in enumerate(c["frames"])
+        ],
     )
     return path
 
@@ -130,7 +136,9 @@ def test_a_panorama_becomes_six_faces(tmp_path: Path, longest: int | None) -> No
     assert len(found.cameras) == 6 * 9
     assert any(note.code == "resampled" and "54 pinhole views" in str(note) for note in found.notes)
     assert {name.rpartition("#")[2] for name in found.cameras.names} == set(FACES)
-    check_faces(found.cameras.take(range(6)).resized(longest), orbit(9), 6 * min(longest or 163, 163) ** 2)
+    check_faces(
+        found.cameras.take(range(6)).resized(longest), orbit(9), 6 * min(longest or 163, 163) ** 2
+    )
 
 
 def test_a_panorama_has_no_seam(tmp_path: Path) -> None:
@@ -141,7 +149,9 @@ def test_a_panorama_has_no_seam(tmp_path: Path) -> None:
     for name, image in (("as it is", noise), ("turned", np.roll(noise, 32, axis=1))):
         (tmp_path / name).mkdir()
         views = read_views(captured(tmp_path / name, image, 1, **lens))
-        sides.append({view.name.partition("#")[2]: load_photo(views, i)[0] for i, view in enumerate(views)})
+        sides.append(
+            {view.name.partition("#")[2]: load_photo(views, i)[0] for i, view in enumerate(views)}
+        )
     for side, following in itertools.pairwise(("front", "right", "back", "left", "front")):
         np.testing.assert_allclose(sides[0][side], sides[1][following], atol=1e-5)
 
@@ -151,11 +161,19 @@ FISHEYE = {"fl_x": 80.0, "fl_y": 80.0, "cx": 150, "cy": 150, "w": 300, "h": 300}
 
 @pytest.mark.parametrize("longest", [None, 60, 33])
 @pytest.mark.parametrize("how", [{"camera_model": "OPENCV_FISHEYE"}, {"is_fisheye": True}])
-def test_a_fisheye_becomes_the_faces_that_it_saw(tmp_path: Path, how: dict, longest: int | None) -> None:
+def test_a_fisheye_becomes_the_faces_that_it_saw(
+    tmp_path: Path, how: dict, longest: int | None
+) -> None:
     path = captured(tmp_path, fisheye(300, 80.0), **FISHEYE, **how)
     views = read_views(path).resized(longest)
     first = views.take([i for i, name in enumerate(views.names) if name.startswith("000.png")])
-    assert [name.rpartition("#")[2] for name in first.names] == ["front", "right", "left", "up", "down"]
+    assert [name.rpartition("#")[2] for name in first.names] == [
+        "front",
+        "right",
+        "left",
+        "up",
+        "down",
+    ]
     masks = [load_mask(first, i) for i in range(5)]
     assert masks[0] is None
     assert all(mask is not None and 0.3 < mask.mean() < 0.9 for mask in masks[1:])
@@ -205,7 +223,9 @@ def test_masks_go_through_the_lens(tmp_path: Path, kind: str, place: str) -> Non
         lens = {"camera_model": "OPENCV_FISHEYE", **FISHEYE}
         size, path = (300, 300), captured(tmp_path, fisheye(300, 80.0), 1, **lens)
     mask = Image.fromarray(
-        np.repeat(255 * (np.arange(size[0]) >= size[0] / 2), size[1]).reshape(size).T.astype(np.uint8)
+        np.repeat(255 * (np.arange(size[0]) >= size[0] / 2), size[1])
+        .reshape(size)
+        .T.astype(np.uint8)
     )
     file = tmp_path / (place.format("000.png") if "{" in place else "left.png")
     file.parent.mkdir(exist_ok=True)
@@ -221,7 +241,12 @@ def test_masks_go_through_the_lens(tmp_path: Path, kind: str, place: str) -> Non
         found = load_mask(views, i)
         assert found is not None or (held & (seen[:, 0] > size[0] / 2)).all()
         found = np.ones(u.size, bool) if found is None else found.ravel()
-        clear = held & (np.abs(seen[:, 0] - size[0] / 2) > 2) & (seen[:, 0] > 2) & (seen[:, 0] < size[0] - 2)
+        clear = (
+            held
+            & (np.abs(seen[:, 0] - size[0] / 2) > 2)
+            & (seen[:, 0] > 2)
+            & (seen[:, 0] < size[0] - 2)
+        )
         np.testing.assert_array_equal(found[clear], seen[clear, 0] > size[0] / 2)
         kept += found.sum()
     assert kept > 1000

@@ -42,7 +42,9 @@ def test_written_quaternions_have_length_1(tmp_path: Path, suffix: str) -> None:
     found = read_splats(path)
     order = np.argsort(-found.means[:, :3] @ [4, 2, 1])  # .splat sorts its rows
     expected = UNIT_QUATS[np.argsort(-odd_scene().means @ [4, 2, 1])]
-    np.testing.assert_allclose(found.quats[order], expected, atol=1e-7 if suffix == ".ply" else 1 / 64)
+    np.testing.assert_allclose(
+        found.quats[order], expected, atol=1e-7 if suffix == ".ply" else 1 / 64
+    )
 
 
 @pytest.mark.parametrize("method", ["default", "fast", "paper"])
@@ -64,12 +66,16 @@ COMMENTS = ["comment", "comment end_header", "comment the end_header line", "com
 
 
 @pytest.mark.parametrize("comment", COMMENTS)
-@pytest.mark.parametrize("after", ["ply", "element vertex 9", "property float y", "property float rot_3"])
+@pytest.mark.parametrize(
+    "after", ["ply", "element vertex 9", "property float y", "property float rot_3"]
+)
 def test_comments_anywhere_in_a_ply_header(tmp_path: Path, comment: str, after: str) -> None:
     path = tmp_path / "a.ply"
     write_splats(path, truth(9, 0))
     content = path.read_bytes()
-    path.write_bytes(content.replace(f"\n{after}\n".encode(), f"\n{after}\n{comment}\n".encode(), 1))
+    path.write_bytes(
+        content.replace(f"\n{after}\n".encode(), f"\n{after}\n{comment}\n".encode(), 1)
+    )
     if after == "ply":
         path.write_bytes(content.replace(b"ply\n", f"ply\n{comment}\n".encode(), 1))
     assert path.read_bytes() != content
@@ -137,7 +143,9 @@ def png(width: int, height: int) -> bytes:
     """A whole PNG of zeros, a thousandth of its pixels large."""
 
     def chunk(kind: bytes, data: bytes) -> bytes:
-        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+        return (
+            struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+        )
 
     packer = zlib.compressobj(9)
     rows = b"".join(packer.compress(bytes(1 + width)) for _ in range(height)) + packer.flush()
@@ -150,7 +158,10 @@ def sog(path: Path, changed: dict[str, bytes]) -> Path:
 
 
 def sog_count(path: Path, count: int) -> Path:
-    return sog(path, {"meta.json": json.dumps({**json.loads(parts()["meta.json"]), "count": count}).encode()})
+    return sog(
+        path,
+        {"meta.json": json.dumps({**json.loads(parts()["meta.json"]), "count": count}).encode()},
+    )
 
 
 def spz_claim(path: Path, version: int, count: int) -> Path:
@@ -166,17 +177,35 @@ def spz_claim(path: Path, version: int, count: int) -> Path:
 
 
 CLAIMS: dict[str, tuple[Callable[[Path], Path], str]] = {
-    "ply of 2**63 rows": (lambda f: header(f / "a.ply", "vertex 9", b"vertex %d" % 2**63), "truncated"),
-    "ply of 2**62 rows": (lambda f: header(f / "a.ply", "vertex 9", b"vertex %d" % 2**62), "truncated"),
-    "ply of 10**30 rows": (lambda f: header(f / "a.ply", "vertex 9", b"vertex 1" + b"0" * 30), "truncated"),
-    "ply of 10**5000 rows": (lambda f: header(f / "a.ply", "vertex 9", b"vertex 1" + b"0" * 5000), "line 4"),
+    "ply of 2**63 rows": (
+        lambda f: header(f / "a.ply", "vertex 9", b"vertex %d" % 2**63),
+        "truncated",
+    ),
+    "ply of 2**62 rows": (
+        lambda f: header(f / "a.ply", "vertex 9", b"vertex %d" % 2**62),
+        "truncated",
+    ),
+    "ply of 10**30 rows": (
+        lambda f: header(f / "a.ply", "vertex 9", b"vertex 1" + b"0" * 30),
+        "truncated",
+    ),
+    "ply of 10**5000 rows": (
+        lambda f: header(f / "a.ply", "vertex 9", b"vertex 1" + b"0" * 5000),
+        "line 4",
+    ),
     "ply not in ascii, another name": (
         lambda f: header(f / "a.ply", "float opacity", "float opacité".encode()),
         "'opacity'",
     ),
-    "views of 4e9 pixels a side": (lambda f: huge_views(f / "a.json"), "4,000,000,000×4,000,000,000"),
+    "views of 4e9 pixels a side": (
+        lambda f: huge_views(f / "a.json"),
+        "4,000,000,000×4,000,000,000",
+    ),
     "colmap of 4e9 pixels a side": (huge_colmap, "4,000,000,000×4,000,000,000"),
-    "inria of 4e9 pixels a side": (lambda f: huge_inria(f / "cameras.json"), "4,000,000,000×4,000,000,000"),
+    "inria of 4e9 pixels a side": (
+        lambda f: huge_inria(f / "cameras.json"),
+        "4,000,000,000×4,000,000,000",
+    ),
     "transforms of 4e9 pixels a side": (
         lambda f: frames(f / "a.json", lambda c: c.update(w=4e9, h=4e9)),
         "4,000,000,000×4,000,000,000",
@@ -186,14 +215,23 @@ CLAIMS: dict[str, tuple[Callable[[Path], Path], str]] = {
         "the limit is 160,000,000",
     ),
     "nested": (lambda f: written(f / "a.json", b"[" * 100_000 + b"]" * 100_000), "nested"),
-    "nested objects": (lambda f: written(f / "a.json", b'{"a":' * 100_000 + b"1" + b"}" * 100_000), "nested"),
-    "an integer of 5000 digits": (lambda f: written(f / "a.json", b"[1" + b"0" * 5000 + b"]"), "digits"),
+    "nested objects": (
+        lambda f: written(f / "a.json", b'{"a":' * 100_000 + b"1" + b"}" * 100_000),
+        "nested",
+    ),
+    "an integer of 5000 digits": (
+        lambda f: written(f / "a.json", b"[1" + b"0" * 5000 + b"]"),
+        "digits",
+    ),
     "angle 0": (lambda f: angle(f / "a.json", 0.0), "camera_angle_x"),
     "angle pi": (lambda f: angle(f / "a.json", math.pi), "camera_angle_x"),
     "angle nan": (lambda f: angle(f / "a.json", math.nan), "camera_angle_x"),
     "gzip bomb": (lambda f: spz_claim(f / "a.spz", 3, 4_000_000), "would unpack to 80,000,000"),
     "zstd claim": (lambda f: spz_claim(f / "a.spz", 4, 4_000_000), "would unpack to"),
-    "zip bomb": (lambda f: sog(f / "a.sog", {"low.webp": bytes(80_000_000)}), "would unpack to 80,000,000"),
+    "zip bomb": (
+        lambda f: sog(f / "a.sog", {"low.webp": bytes(80_000_000)}),
+        "would unpack to 80,000,000",
+    ),
     "png bomb": (lambda f: sog(f / "a.sog", {"low.webp": png(20_000, 10_000)}), "160,000,000"),
     "sog of 10**15 rows": (lambda f: sog_count(f / "a.sog", 10**15), "pixels for"),
     "sog with nested meta": (lambda f: sog(f / "a.sog", {"meta.json": b"[" * 100_000}), "nested"),
@@ -219,7 +257,10 @@ MESH = {"mesh": 0}
 def test_a_long_chain_of_nodes_is_followed_once(tmp_path: Path) -> None:
     """Each node is visited a few times, not once per descendant."""
     count = 20_000
-    nodes: list[dict[str, Any]] = [MESH, *({"children": [i], "translation": [0, 0, 1]} for i in range(count))]
+    nodes: list[dict[str, Any]] = [
+        MESH,
+        *({"children": [i], "translation": [0, 0, 1]} for i in range(count)),
+    ]
     path = node_tree(tmp_path / "a.glb", nodes)
     assert read_scene(path).splats.offset.tolist() == [0, 0, count]
 
@@ -256,7 +297,9 @@ def test_zstd_frames_are_unpacked_up_to_their_size() -> None:
     assert len(_unpacked(zstd.compress(bytes(80_000_000)), 1000)) == 1001
 
 
-def test_huge_photos_are_rejected_before_decoding(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_huge_photos_are_rejected_before_decoding(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     monkeypatch.setattr(
         "g2ard.scene.cameras.LARGEST_IMAGE", 1_000_000
     )  # Pillow warns of what is near the true limit

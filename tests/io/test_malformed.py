@@ -148,7 +148,11 @@ FAULTS: dict[str, list[tuple[str, Any, Fault]]] = {
         ("nodes", [MESH, {"children": [0]}, {"children": [0]}], "node 0 has 2 parents"),
         ("nodes", [MESH | {"translation": [[1], [2], [3]]}], ("nodes[0].translation[0]", None)),
         ("nodes", [MESH | {"translation": [1]}], ("nodes[0].translation[1]", None)),
-        ("nodes", [MESH | NODE_FAR, NODE_FAR | {"children": [0]}], r"invalid translation \(inf, inf, inf\)"),
+        (
+            "nodes",
+            [MESH | NODE_FAR, NODE_FAR | {"children": [0]}],
+            r"invalid translation \(inf, inf, inf\)",
+        ),
         *(
             (place, index, (re.sub(r"\.(\d+)", r"[\1]", place), None))
             for place in (
@@ -165,9 +169,12 @@ FAULTS: dict[str, list[tuple[str, Any, Fault]]] = {
 
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize(
-    ("what", "place", "value", "fault"), [(what, *row) for what, rows in FAULTS.items() for row in rows]
+    ("what", "place", "value", "fault"),
+    [(what, *row) for what, rows in FAULTS.items() for row in rows],
 )
-def test_a_wrong_property_is_named(tmp_path: Path, what: str, place: str, value: Any, fault: Fault) -> None:
+def test_a_wrong_property_is_named(
+    tmp_path: Path, what: str, place: str, value: Any, fault: Fault
+) -> None:
     path = (
         transforms(tmp_path / "a.json", orbit(2), fl_y=None)
         if what == "transforms"
@@ -204,12 +211,20 @@ DAMAGES: list[tuple[str, Callable[[bytes], bytes], str]] = [
     ("ksplat", lambda data: b"\1" + data[1:], "unsupported version 1.1"),
     ("ksplat", lambda data: data[:20] + b"\7" + data[21:], "unsupported compression level 7"),
     ("ksplat", lambda data: data[:4136] + b"\4" + data[4137:], "section 0 .*SH degree 4"),
-    ("ksplat", lambda data: data[:4128] + b"\xff" + data[4129:], "section 0 has inconsistent buckets"),
+    (
+        "ksplat",
+        lambda data: data[:4128] + b"\xff" + data[4129:],
+        "section 0 has inconsistent buckets",
+    ),
     ("ksplat", lambda data: data[:5120] + bytes(4) + data[5124:], "section 0 has more rows"),
     ("glb", lambda data: data[:10], "not a .glb"),
     ("glb", lambda data: data[: len(data) // 2], "truncated|broken"),
     ("glb", lambda data: data.replace(b'"ellipse"', b'"boxes!!"'), "kernel"),
-    ("glb", lambda data: data.replace(b"splatting:SCALE", b"splatting:SCALY"), "SCALE.* is missing"),
+    (
+        "glb",
+        lambda data: data.replace(b"splatting:SCALE", b"splatting:SCALY"),
+        "SCALE.* is missing",
+    ),
     (
         "glb",
         lambda data: data.replace(b'"count":9,', b'"count":99,', 1).replace(b"g2ard", b"g2ar"),
@@ -217,7 +232,11 @@ DAMAGES: list[tuple[str, Callable[[bytes], bytes], str]] = [
     ),
     ("spz 3", lambda data: packed(b"NOPE"), "not an SPZ"),
     ("spz 3", lambda data: b"", "not an SPZ"),
-    ("spz 3", lambda data: packed(b"NGSP" + struct.pack("<IIBBBB", 9, 1, 0, 12, 0, 0)), "version 9"),
+    (
+        "spz 3",
+        lambda data: packed(b"NGSP" + struct.pack("<IIBBBB", 9, 1, 0, 12, 0, 0)),
+        "version 9",
+    ),
     *(("splat", lambda data, size=size: bytes(size), "multiple of 32") for size in (0, 33)),
     ("sog", lambda data: b"PK\x03\x04nonsense", "not a complete .sog archive"),
     ("poses_bounds.npy", lambda data: b"no array", "not a NumPy array"),
@@ -237,7 +256,9 @@ DAMAGES: list[tuple[str, Callable[[bytes], bytes], str]] = [
 
 
 @pytest.mark.parametrize(("what", "damage", "words"), DAMAGES)
-def test_damage_is_named(tmp_path: Path, what: str, damage: Callable[[bytes], bytes], words: str) -> None:
+def test_damage_is_named(
+    tmp_path: Path, what: str, damage: Callable[[bytes], bytes], words: str
+) -> None:
     path = MAKERS[what](tmp_path)
     path.write_bytes(damage(path.read_bytes()))
     line = read_checked(path)

@@ -42,16 +42,23 @@ def test_compressed_ply_of_other_chunks(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("version", [2, 3, 4])
 @pytest.mark.parametrize("bits", [25, 64, 255])
-def test_spz_of_more_fractional_bits_than_a_position_has(tmp_path: Path, version: int, bits: int) -> None:
+def test_spz_of_more_fractional_bits_than_a_position_has(
+    tmp_path: Path, version: int, bits: int
+) -> None:
     path = saved(tmp_path, "spz", truth(3, 0), spz_version=version)
     data = path.read_bytes()
-    head, means = bytearray(data if version == 4 else gzip.decompress(data)), read_splats(path).means
+    head, means = (
+        bytearray(data if version == 4 else gzip.decompress(data)),
+        read_splats(path).means,
+    )
     usual = head[13]
     for value in (24, bits):
         head[13] = value
         path.write_bytes(bytes(head) if version == 4 else gzip.compress(bytes(head)))
         if value == 24:
-            np.testing.assert_allclose(read_splats(path).means, means / 2.0 ** (24 - usual), rtol=1e-6)
+            np.testing.assert_allclose(
+                read_splats(path).means, means / 2.0 ** (24 - usual), rtol=1e-6
+            )
             continue
         with faulty(path, ("fractionalBits", None)):
             read_splats(path)

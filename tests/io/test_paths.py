@@ -26,7 +26,9 @@ def scene(tmp_path: Path) -> Path:
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="named pipes need POSIX")
-def test_a_pipe_is_rejected_as_a_file(tmp_path: Path, scene: Path, command_line: CommandLine) -> None:
+def test_a_pipe_is_rejected_as_a_file(
+    tmp_path: Path, scene: Path, command_line: CommandLine
+) -> None:
     for name in ("a.ply", "a.spz", "a.las", "a.json"):
         os.mkfifo(tmp_path / name)
         with pytest.raises(InputError, match=rf"{name}: not a regular file$"):
@@ -37,7 +39,9 @@ def test_a_pipe_is_rejected_as_a_file(tmp_path: Path, scene: Path, command_line:
     write_views(views_file, views(1))
     os.mkfifo(tmp_path / "photo.png")
     edit(views_file, lambda content: content["views"][0].update(image="photo.png"))
-    status, _, said = command_line("evaluate", scene, "--views", views_file, "--split", "all", cwd=tmp_path)
+    status, _, said = command_line(
+        "evaluate", scene, "--views", views_file, "--split", "all", cwd=tmp_path
+    )
     assert (status, "none of 1 photo found" in said) == (1, True)
 
 
@@ -55,17 +59,34 @@ def test_links_in_a_circle(tmp_path: Path, scene: Path, command_line: CommandLin
     assert loop.is_symlink()
 
 
-def test_no_view_is_written_outside_its_dir(tmp_path: Path, scene: Path, command_line: CommandLine) -> None:
+def test_no_view_is_written_outside_its_dir(
+    tmp_path: Path, scene: Path, command_line: CommandLine
+) -> None:
     names = ["../precious.png", f"{tmp_path}/evil", "a.png", "a.jpg", "plain.png"]
     write_views(tmp_path / "v.json", views(5))
-    edit(tmp_path / "v.json", lambda c: [v.update(name=n) for v, n in zip(c["views"], names, strict=True)])
+    edit(
+        tmp_path / "v.json",
+        lambda c: [v.update(name=n) for v, n in zip(c["views"], names, strict=True)],
+    )
     precious = tmp_path / "precious.depth.npy"
     precious.write_text("mine")
-    words = ("render", scene, "--views", tmp_path / "v.json", "-o", tmp_path / "out", "--depth", "--size", 32)
+    words = (
+        "render",
+        scene,
+        "--views",
+        tmp_path / "v.json",
+        "-o",
+        tmp_path / "out",
+        "--depth",
+        "--size",
+        32,
+    )
     succeeds(command_line, tmp_path, *words)
     assert precious.read_text() == "mine"
     assert not (tmp_path / "evil.png").exists()
-    made = {path.relative_to(tmp_path / "out").as_posix() for path in (tmp_path / "out").rglob("*.png")}
+    made = {
+        path.relative_to(tmp_path / "out").as_posix() for path in (tmp_path / "out").rglob("*.png")
+    }
     inside = (tmp_path / "evil.png").relative_to(tmp_path.anchor).as_posix()
     assert made == {"precious.png", inside, "a.png.png", "a.jpg.png", "plain.png"}
 
@@ -79,7 +100,9 @@ def test_invalid_file_names(name: str) -> None:
 
 def test_names_of_one_file() -> None:
     assert output_names("v.json", ["C:\\photos\\a.png", "b"]) == ["photos/a", "b"]
-    with pytest.raises(InputError, match=r"'\.\./a\.png' and another view would both be written as 'a\.png'"):
+    with pytest.raises(
+        InputError, match=r"'\.\./a\.png' and another view would both be written as 'a\.png'"
+    ):
         output_names("v.json", ["../a.png", "a.png"])
 
 
@@ -94,7 +117,9 @@ def test_an_offset_that_is_not_finite(scene: Path, offset: str) -> None:
 
 
 def test_an_absurd_number_of_a_coefficient(scene: Path) -> None:
-    content = scene.read_bytes().replace(b"property float opacity", b"property float f_rest_" + b"9" * 5000)
+    content = scene.read_bytes().replace(
+        b"property float opacity", b"property float f_rest_" + b"9" * 5000
+    )
     scene.write_bytes(content)
     with pytest.raises(InputError, match="'opacity'"):
         read_splats(scene)

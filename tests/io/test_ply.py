@@ -24,7 +24,9 @@ from helpers.ply_files import columns, save, scene
 
 def assert_same(a: Splats, b: Splats, rtol: float = 2e-6) -> None:
     for name in ARRAYS:
-        np.testing.assert_allclose(getattr(a, name), getattr(b, name), rtol=rtol, atol=1e-7, err_msg=name)
+        np.testing.assert_allclose(
+            getattr(a, name), getattr(b, name), rtol=rtol, atol=1e-7, err_msg=name
+        )
         assert getattr(a, name).dtype == np.float32
         assert getattr(a, name).flags.c_contiguous
 
@@ -55,7 +57,12 @@ def test_reads_any_encoding(tmp_path: Path, options: dict[str, object]) -> None:
 
 
 @settings(max_examples=25, deadline=None)
-@given(count=st.integers(1, 40), degree=st.integers(0, 3), seed=st.integers(0, 2**32), normals=st.booleans())
+@given(
+    count=st.integers(1, 40),
+    degree=st.integers(0, 3),
+    seed=st.integers(0, 2**32),
+    normals=st.booleans(),
+)
 def test_round_trip(tmp_path_factory, count: int, degree: int, seed: int, normals: bool) -> None:
     path = tmp_path_factory.mktemp("ply") / "a.ply"
     truth = scene(count, degree, seed)
@@ -139,7 +146,9 @@ def test_meaningful_infinities_are_clamped(tmp_path: Path) -> None:
         "clamped_scales": 3,
         "zero_quats": 1,
     }
-    np.testing.assert_array_equal(found.splats.logit_opacities[:3], [LOGIT_LIMIT, -LOGIT_LIMIT, LOGIT_LIMIT])
+    np.testing.assert_array_equal(
+        found.splats.logit_opacities[:3], [LOGIT_LIMIT, -LOGIT_LIMIT, LOGIT_LIMIT]
+    )
     assert found.splats.opacities[0] > 0.9999998
     squares = found.splats.scales.astype(np.float32) ** 2
     assert np.isfinite(squares).all()
@@ -197,10 +206,14 @@ def test_missing_and_unknown_files(tmp_path: Path) -> None:
 
 
 def test_cloud_is_not_a_scene(tmp_path: Path) -> None:
-    path = save(tmp_path / "a.ply", {n: np.zeros(2) for n in ("x", "y", "z", "red", "green", "blue")})
+    path = save(
+        tmp_path / "a.ply", {n: np.zeros(2) for n in ("x", "y", "z", "red", "green", "blue")}
+    )
     assert kind(path) == "points"
     for read in (read_splats, lambda path: Source(path).scene):
-        with pytest.raises(InputError, match="expected a Gaussian scene, found a coloured point cloud"):
+        with pytest.raises(
+            InputError, match="expected a Gaussian scene, found a coloured point cloud"
+        ):
             read(path)
 
 
@@ -222,15 +235,27 @@ def with_header(path: Path, change: Any) -> Path:
     return path
 
 
-REMARKS = ["Prüfstand – Büro", "导出", "\U0001f600 ok", "a\u2028b", "end_header é", "\x85 end_header", "µm²"]
+REMARKS = [
+    "Prüfstand – Büro",
+    "导出",
+    "\U0001f600 ok",
+    "a\u2028b",
+    "end_header é",
+    "\x85 end_header",
+    "µm²",
+]
 
 
 @pytest.mark.parametrize("keyword", ["comment", "obj_info"])
 @pytest.mark.parametrize("encoding", ["utf-8", "utf-16-le", "latin-1", "gb18030"])
 @pytest.mark.parametrize("options", [{"byte_order": "<"}, {"byte_order": ">"}, {"text": True}])
-def test_remarks_in_any_language(tmp_path: Path, keyword: str, encoding: str, options: dict) -> None:
+def test_remarks_in_any_language(
+    tmp_path: Path, keyword: str, encoding: str, options: dict
+) -> None:
     truth = scene(count=7)
-    remarks = [r.encode(encoding, "replace").replace(b"\n", b"").replace(b"\r", b"") for r in REMARKS]
+    remarks = [
+        r.encode(encoding, "replace").replace(b"\n", b"").replace(b"\r", b"") for r in REMARKS
+    ]
     lines = b"".join(keyword.encode() + b" " + remark + b"\n" for remark in remarks)
     path = save(tmp_path / "a.ply", columns(truth), **options)
     with_header(path, lambda head: head.replace(b"element vertex", lines + b"element vertex"))
@@ -249,9 +274,13 @@ def test_line_ends_and_byte_order_marks(tmp_path: Path, mark: bytes, eol: bytes)
 
 
 @pytest.mark.parametrize("dtype", ["u1", "u2", "i4", "f4", "f8"])
-@pytest.mark.parametrize("names", [("red", "green", "blue"), ("r", "g", "b"), ("Red", "Green", "Blue")])
+@pytest.mark.parametrize(
+    "names", [("red", "green", "blue"), ("r", "g", "b"), ("Red", "Green", "Blue")]
+)
 @pytest.mark.parametrize("white", [1, 255, 65535])
-def test_colours_in_place_of_harmonics(tmp_path: Path, dtype: str, names: tuple, white: int) -> None:
+def test_colours_in_place_of_harmonics(
+    tmp_path: Path, dtype: str, names: tuple, white: int
+) -> None:
     """Values tell what white is, not types; bytes hold no more than 255, fractions need a real type."""
     if (white == 1) == (dtype[0] != "f") or (white > 255 and dtype == "u1"):
         return
@@ -262,7 +291,9 @@ def test_colours_in_place_of_harmonics(tmp_path: Path, dtype: str, names: tuple,
     for name, values in cols.items():
         rows[name] = values
     for channel, name in enumerate(names):
-        rows[name] = np.rint(rgb[:, channel] * white) if dtype[0] != "f" else rgb[:, channel] * white
+        rows[name] = (
+            np.rint(rgb[:, channel] * white) if dtype[0] != "f" else rgb[:, channel] * white
+        )
     PlyData([PlyElement.describe(rows, "vertex")]).write(str(tmp_path / "a.ply"))
     found = read_splats(tmp_path / "a.ply")
     np.testing.assert_allclose(found.colors, rgb, atol=0.6 / white if dtype[0] != "f" else 1e-6)
@@ -274,7 +305,10 @@ def test_colours_in_place_of_harmonics(tmp_path: Path, dtype: str, names: tuple,
 def test_names_of_cloudcompare(tmp_path: Path, degree: int, prefix: str) -> None:
     truth = scene(degree=degree)
     cols = {name if name in "xyz" else prefix + name: v for name, v in columns(truth).items()}
-    path = save(tmp_path / "a.ply", cols | {"red": np.zeros(20), "green": np.zeros(20), "blue": np.zeros(20)})
+    path = save(
+        tmp_path / "a.ply",
+        cols | {"red": np.zeros(20), "green": np.zeros(20), "blue": np.zeros(20)},
+    )
     assert kind(path) == "splats"
     assert_same(read_splats(path), truth)
 
@@ -285,13 +319,17 @@ def test_one_scale_for_three(tmp_path: Path, name: str, turned: bool) -> None:
     truth = scene()
     cols = columns(truth)
     cols = {
-        key: v for key, v in cols.items() if not key.startswith("scale") and (turned or "rot_" not in key)
+        key: v
+        for key, v in cols.items()
+        if not key.startswith("scale") and (turned or "rot_" not in key)
     }
     read = read_scene(save(tmp_path / "a.ply", cols | {name: np.log(truth.scales[:, 1])}))
     assert not [note for note in read.notes if note.code == "ignored_properties"]
     found = read.splats
     np.testing.assert_allclose(found.scales, truth.scales[:, [1, 1, 1]], rtol=1e-5)
-    np.testing.assert_allclose(found.quats, truth.quats if turned else [[1, 0, 0, 0]] * 20, atol=1e-6)
+    np.testing.assert_allclose(
+        found.quats, truth.quats if turned else [[1, 0, 0, 0]] * 20, atol=1e-6
+    )
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -310,10 +348,15 @@ def test_the_mip_filter_is_applied(tmp_path: Path, seed: int, name: str) -> None
     assert [note.code for note in found.notes] == ["mip_filter"]
 
 
-@pytest.mark.parametrize("names", [["delta_vertex_0"], ["frame_1", "frame_2", "frame_3", "frame_4"]])
+@pytest.mark.parametrize(
+    "names", [["delta_vertex_0"], ["frame_1", "frame_2", "frame_3", "frame_4"]]
+)
 def test_animated_scenes_are_read_at_frame_0(tmp_path: Path, names: list[str]) -> None:
     truth = scene()
-    rows = save(tmp_path / "a.ply", columns(truth)) and PlyData.read(str(tmp_path / "a.ply"))["vertex"].data
+    rows = (
+        save(tmp_path / "a.ply", columns(truth))
+        and PlyData.read(str(tmp_path / "a.ply"))["vertex"].data
+    )
     moves = np.zeros(20, [(axis, "f4") for axis in "xyz"])
     other = np.zeros(1, [("time", "f4")])
     elements = [
@@ -352,7 +395,9 @@ def test_activated_values_are_noted(tmp_path: Path, what: str, unit: float) -> N
     notes = read_scene(save(tmp_path / "a.ply", cols)).notes
     assert [note.code for note in notes] == ["activated"] * (what != "neither")
     assert all(
-        (word in notes[0].text) == (what in (word, "both")) for word in ("scales", "opacities") if notes
+        (word in notes[0].text) == (what in (word, "both"))
+        for word in ("scales", "opacities")
+        if notes
     )
 
 
@@ -376,7 +421,9 @@ UP = [
 
 @pytest.mark.parametrize(("comments", "up"), UP)
 @pytest.mark.parametrize("name", ["b.ply", "b.compressed.ply"])
-def test_the_up_direction_of_comments(tmp_path: Path, comments: list[str], up: Any, name: str) -> None:
+def test_the_up_direction_of_comments(
+    tmp_path: Path, comments: list[str], up: Any, name: str
+) -> None:
     """It is read, used, turned with the scene, and written."""
     path = save(tmp_path / "a.ply", columns(scene(200)), comments=comments)
     found = read_splats(path)
@@ -397,7 +444,9 @@ def test_the_up_direction_of_comments(tmp_path: Path, comments: list[str], up: A
     assert read_splats(tmp_path / "tiles").up == pytest.approx(up)
 
 
-@pytest.mark.parametrize("names", [["t", "scale_t"], ["motion_0"], ["trbf_center"], ["rot_r_0"], ["time"]])
+@pytest.mark.parametrize(
+    "names", [["t", "scale_t"], ["motion_0"], ["trbf_center"], ["rot_r_0"], ["time"]]
+)
 def test_scenes_that_move_are_told(tmp_path: Path, names: list[str]) -> None:
     path = save(tmp_path / "a.ply", columns(scene()) | {name: np.ones(20) for name in names})
     assert [note.code for note in read_scene(path).notes] == ["ignored_properties", "moving"]

@@ -47,7 +47,9 @@ def codes(path: Path, **options: Path) -> set[str]:
 @pytest.mark.parametrize(
     "listed", ["a/1.png", "a\\1.png", "/mnt/x/images/a/1.png", "D:\\x\\images\\a\\1.png"]
 )
-@pytest.mark.parametrize("stored", ["images/a/1.png", "a/1.png", "images/a/1.JPG", "images/a/1.tiff"])
+@pytest.mark.parametrize(
+    "stored", ["images/a/1.png", "a/1.png", "images/a/1.JPG", "images/a/1.tiff"]
+)
 def test_one_order_finds_photos(tmp_path: Path, listed: str, stored: str) -> None:
     photo(tmp_path / "images" / "b" / "1.png")
     path = tmp_path / stored
@@ -68,7 +70,9 @@ def test_the_order_of_names(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("write", ["colmap", "transforms"])
-@pytest.mark.parametrize("listed", ["{}", "cam\\{}", "./cam/{}", "/mnt/capture/cam/{}", "C:/capture/cam/{}"])
+@pytest.mark.parametrize(
+    "listed", ["{}", "cam\\{}", "./cam/{}", "/mnt/capture/cam/{}", "C:/capture/cam/{}"]
+)
 @pytest.mark.parametrize("moved", [False, True])
 def test_every_format_uses_it(tmp_path: Path, write: str, listed: str, moved: bool) -> None:
     names = [listed.format(name) for name in NAMES]
@@ -88,7 +92,9 @@ def test_every_format_uses_it(tmp_path: Path, write: str, listed: str, moved: bo
 
 
 def test_equal_names_in_folders_are_not_mixed_up(tmp_path: Path) -> None:
-    path = captured(tmp_path, ["images/a/0.png", "images/b/0.png", "images/a/1.png", "images/b/1.png"])
+    path = captured(
+        tmp_path, ["images/a/0.png", "images/b/0.png", "images/a/1.png", "images/b/1.png"]
+    )
     for name in ("0.png", "1.png"):
         photo(tmp_path / "flat" / name)
     assert "equal_names" in codes(path, images=tmp_path / "flat")
@@ -106,7 +112,9 @@ def test_photos_converted_later_are_found_with_a_note(tmp_path: Path, suffix: st
     assert ("other_suffix" in codes(folder)) == (suffix != ".PNG")
 
 
-@pytest.mark.parametrize("place", ["masks/{0}", "masks/{0}.png", "mask/{1}.png", "images/masks/cam/{0}"])
+@pytest.mark.parametrize(
+    "place", ["masks/{0}", "masks/{0}.png", "mask/{1}.png", "images/masks/cam/{0}"]
+)
 @pytest.mark.parametrize("deep", [False, True])
 def test_masks_are_found_in_folders(tmp_path: Path, place: str, deep: bool) -> None:
     names = [f"images/{'cam/x/' * deep}{i}.jpg" for i in range(4)]
@@ -143,11 +151,16 @@ def test_a_mask_is_never_its_photo(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("place", "found"),
     [
-        *((place, True) for place in ("sparse/1", "sparse", "colmap/sparse/3", "colmap/sparse", "7")),
+        *(
+            (place, True)
+            for place in ("sparse/1", "sparse", "colmap/sparse/3", "colmap/sparse", "7")
+        ),
         *((place, False) for place in ("dense/sparse", "model", "sparse/geo", "out/colmap/sparse")),
     ],
 )
-def test_models_elsewhere_are_read_or_named(tmp_path: Path, text: bool, place: str, found: bool) -> None:
+def test_models_elsewhere_are_read_or_named(
+    tmp_path: Path, text: bool, place: str, found: bool
+) -> None:
     project(tmp_path, text)
     (tmp_path / "sparse" / "0").rename(tmp_path / "kept")
     shutil.rmtree(tmp_path / "sparse")
@@ -175,7 +188,9 @@ def test_tables_in_capitals_are_read(tmp_path: Path, text: bool) -> None:
 
 @pytest.mark.parametrize(("small", "large"), [("0", "1"), ("1", "0"), ("2", "10")])
 @pytest.mark.parametrize("text", [False, True])
-def test_the_largest_of_several_models_is_read(tmp_path: Path, small: str, large: str, text: bool) -> None:
+def test_the_largest_of_several_models_is_read(
+    tmp_path: Path, small: str, large: str, text: bool
+) -> None:
     project(tmp_path, text)
     (tmp_path / "sparse" / "0").rename(tmp_path / "sparse" / "large")
     colmap(tmp_path / "part", orbit(2), text)
@@ -190,7 +205,9 @@ def test_the_largest_of_several_models_is_read(tmp_path: Path, small: str, large
 
 
 @pytest.mark.parametrize("points", ["", "1.5 2.5 -1", "1.5 2.5 -1 3.5 4.5 7 0 0 12"])
-@pytest.mark.parametrize("kept", [lambda i: False, lambda i: i % 2, lambda i: i != 3, lambda i: True])
+@pytest.mark.parametrize(
+    "kept", [lambda i: False, lambda i: i % 2, lambda i: i != 3, lambda i: True]
+)
 def test_images_txt_with_and_without_lines_of_points(
     tmp_path: Path, kept: Callable[[int], bool], points: str
 ) -> None:
@@ -213,8 +230,12 @@ def test_byte_order_marks(tmp_path: Path, encoding: str) -> None:
     assert len(read_sparse_points(find_sparse_file(tmp_path / "a")) or ()) == 2
 
 
-@pytest.mark.parametrize("word", ["nan", "-nan(ind)", "NaN", "inf", "-1.#IND", "1.#QNAN", "nan(snan)"])
-@pytest.mark.parametrize(("table", "column"), [("cameras", 4), ("cameras", 6), ("images", 2), ("images", 7)])
+@pytest.mark.parametrize(
+    "word", ["nan", "-nan(ind)", "NaN", "inf", "-1.#IND", "1.#QNAN", "nan(snan)"]
+)
+@pytest.mark.parametrize(
+    ("table", "column"), [("cameras", 4), ("cameras", 6), ("images", 2), ("images", 7)]
+)
 def test_numbers_that_are_not_finite_cost_their_views(
     tmp_path: Path, word: str, table: str, column: int
 ) -> None:
@@ -225,7 +246,9 @@ def test_numbers_that_are_not_finite_cost_their_views(
         images = file.with_name("images.txt")
         images.write_text(images.read_text().replace("7 photo 2", "8 photo 2"))
     lines = file.read_text().splitlines()
-    at = next(i for i, line in enumerate(lines) if line.startswith("8 " if table == "cameras" else "3 "))
+    at = next(
+        i for i, line in enumerate(lines) if line.startswith("8 " if table == "cameras" else "3 ")
+    )
     words = lines[at].split(" ")
     lines[at] = " ".join([*words[:column], word, *words[column + 1 :]])
     file.write_text("\n".join(lines) + "\n")
@@ -270,7 +293,9 @@ def test_frames_apart_are_held_out(tmp_path: Path, key: str, split: str) -> None
 
 @pytest.mark.parametrize("orientation", range(1, 9))
 @pytest.mark.parametrize("upright", [False, True])
-def test_exif_turns_photos_where_only_that_fits(tmp_path: Path, orientation: int, upright: bool) -> None:
+def test_exif_turns_photos_where_only_that_fits(
+    tmp_path: Path, orientation: int, upright: bool
+) -> None:
     pixels = np.random.default_rng(0).integers(0, 256, (6, 8, 3), dtype=np.uint8)
     exif = Image.Exif()
     exif[0x0112] = orientation
@@ -313,7 +338,9 @@ def test_photos_that_cannot_be_read_are_named_at_once(tmp_path: Path, what: str)
 
 @pytest.mark.parametrize("suffix", [".TIF", ".heic", ".exr", ".bmp", ".dng", ".jpg"])
 @pytest.mark.parametrize("below", ["", "images/", "cam0/", "images/cam 1/"])
-def test_folders_of_photos_without_poses_are_recognised(tmp_path: Path, suffix: str, below: str) -> None:
+def test_folders_of_photos_without_poses_are_recognised(
+    tmp_path: Path, suffix: str, below: str
+) -> None:
     _made(tmp_path / f"{below}a{suffix}").write_bytes(b"x")
     with pytest.raises(InputError, match="photos without poses") as caught:
         read_views(tmp_path)
@@ -337,7 +364,9 @@ def test_points_that_cannot_be_used_are_a_warning(tmp_path: Path, damage: str, t
         file.unlink()
     else:
         data = file.read_bytes()
-        file.write_bytes((b"# none\n" if text else bytes(8)) if damage == "empty" else data[: len(data) - 25])
+        file.write_bytes(
+            (b"# none\n" if text else bytes(8)) if damage == "empty" else data[: len(data) - 25]
+        )
     said: list[str] = []
     points = read_sparse_points(find_sparse_file(tmp_path), said.append)
     assert points is None or (damage == "cut" and text)

@@ -22,7 +22,9 @@ from helpers.sog_files import folder, parts, square, webp, zipped
 
 def decoded(files: dict[str, bytes], name: str, count: int) -> np.ndarray:
     return (
-        np.asarray(Image.open(io.BytesIO(files[name])).convert("RGBA")).reshape(-1, 4)[:count].astype(float)
+        np.asarray(Image.open(io.BytesIO(files[name])).convert("RGBA"))
+        .reshape(-1, 4)[:count]
+        .astype(float)
     )
 
 
@@ -41,7 +43,9 @@ def test_decodes_every_field(tmp_path: Path, version: int, bands: int) -> None:
         for axis in range(3):
             lo, hi = meta["means"]["mins"][axis], meta["means"]["maxs"][axis]
             log = lo + (hi - lo) * (low[i, axis] + 256 * high[i, axis]) / 65535
-            assert splats.means[i, axis] == pytest.approx(np.sign(log) * (np.exp(abs(log)) - 1), abs=1e-6)
+            assert splats.means[i, axis] == pytest.approx(
+                np.sign(log) * (np.exp(abs(log)) - 1), abs=1e-6
+            )
             if version == 2:
                 log_scale = -9 + 8 * scales[i, axis] / 255
                 color = -3 + 6 * sh0[i, axis] / 255
@@ -57,10 +61,14 @@ def test_decodes_every_field(tmp_path: Path, version: int, bands: int) -> None:
         others = [k for k in range(4) if k != left_out]
         expected = (quats[i, :3] / 255 - 0.5) * np.sqrt(2)
         np.testing.assert_allclose(splats.quats[i, others], expected, atol=1e-6)
-        assert splats.quats[i, left_out] == pytest.approx(np.sqrt(max(0, 1 - (expected**2).sum())), abs=1e-6)
+        assert splats.quats[i, left_out] == pytest.approx(
+            np.sqrt(max(0, 1 - (expected**2).sum())), abs=1e-6
+        )
     if bands:
         rest = splats.shN.shape[1]
-        palette = np.asarray(Image.open(io.BytesIO(files["shN_centroids.webp"])).convert("RGB")).astype(float)
+        palette = np.asarray(
+            Image.open(io.BytesIO(files["shN_centroids.webp"])).convert("RGB")
+        ).astype(float)
         labels = decoded(files, "shN_labels.webp", count)[:, :2] @ [1, 256]
         for i, label in enumerate(labels.astype(int)):
             column = (label % 64) * rest
@@ -109,7 +117,11 @@ def test_lod_meta_lists_the_chunks(tmp_path: Path) -> None:
 @pytest.mark.parametrize("slash", ["/", "\\"])
 def test_names_of_windows_in_indexes(tmp_path: Path, slash: str) -> None:
     folder(tmp_path / "a", parts(count=4))
-    index = {"version": 1, "filenames": [f"a{slash}meta.json"], "tree": {"lods": {"0": {"file": 0}}}}
+    index = {
+        "version": 1,
+        "filenames": [f"a{slash}meta.json"],
+        "tree": {"lods": {"0": {"file": 0}}},
+    }
     (tmp_path / "lod-meta.json").write_text(json.dumps(index))
     assert len(read_splats(tmp_path)) == 4
     (tmp_path / "lod-meta.json").write_text(json.dumps({**index, "version": 2}))

@@ -10,7 +10,9 @@ from g2ard.io.splits import split_mask
 
 
 def split_names(views: str | Path, names: list[str], which: str) -> list[str]:
-    return [name for name, chosen in zip(names, split_mask(views, names, which), strict=True) if chosen]
+    return [
+        name for name, chosen in zip(names, split_mask(views, names, which), strict=True) if chosen
+    ]
 
 
 def test_every_eighth_sorted_name_is_test() -> None:
@@ -29,7 +31,8 @@ def test_split_file_wins(tmp_path: Path) -> None:
     sparse = tmp_path / "sparse" / "0"
     sparse.mkdir(parents=True)
     assert split_names(sparse, names, "train") == ["a.jpg", "b.jpg"]
-    assert split_names(tmp_path, ["left/b.jpg", "b.jpg"], "train") == ["b.jpg"]  # stems alone would confuse
+    # stems alone would confuse
+    assert split_names(tmp_path, ["left/b.jpg", "b.jpg"], "train") == ["b.jpg"]
     with pytest.raises(InputError, match=r"no split 'val' \(there are ood, test, train\)"):
         split_names(tmp_path, names, "val")
     with pytest.raises(

@@ -18,14 +18,20 @@ from helpers.sog_files import folder, parts
 
 
 def joined(blocks: list[Splats]) -> Splats:
-    return replace(blocks[0], **{n: np.concatenate([getattr(b, n) for b in blocks]) for n in ARRAYS})
+    return replace(
+        blocks[0], **{n: np.concatenate([getattr(b, n) for b in blocks]) for n in ARRAYS}
+    )
 
 
 def written(name: str, degree: int) -> Callable[[Path], Path]:
     def write(to: Path) -> Path:
         write_splats(
             to / name,
-            scene(700, degree, offset=(4e5, 5e6, 1) if not name.endswith((".splat", ".spz")) else (0, 0, 0)),
+            scene(
+                700,
+                degree,
+                offset=(4e5, 5e6, 1) if not name.endswith((".splat", ".spz")) else (0, 0, 0),
+            ),
         )
         return to if name == "meta.json" else to / name
 
@@ -59,7 +65,11 @@ def levels(to: Path) -> Path:
 @pytest.mark.parametrize(
     "make",
     [
-        *(written(name, degree) for name in ("a.ply", "a.compressed.ply", "a.sog") for degree in (0, 3)),
+        *(
+            written(name, degree)
+            for name in ("a.ply", "a.compressed.ply", "a.sog")
+            for degree in (0, 3)
+        ),
         *(written(name, 1) for name in ("meta.json", "a.splat", "a.glb", "a.spz")),
         bad_ply,
         double_ply,
@@ -105,7 +115,10 @@ def test_blocks_are_the_scene(tmp_path: Path, make: Callable[[Path], Path]) -> N
 
 
 def test_several_are_one_scene(tmp_path: Path) -> None:
-    scenes = [scene(300, 1, seed=1, offset=(1000.0, 0, 0)), scene(200, 3, seed=2, offset=(1010.0, 0, 2))]
+    scenes = [
+        scene(300, 1, seed=1, offset=(1000.0, 0, 0)),
+        scene(200, 3, seed=2, offset=(1010.0, 0, 2)),
+    ]
     paths = [tmp_path / "a.ply", tmp_path / "b.compressed.ply"]
     for path, splats in zip(paths, scenes, strict=True):
         write_splats(path, splats)

@@ -47,7 +47,9 @@ def test_six_columns(tmp_path: Path, suffix: str, between: str, point: str, top:
 
 @pytest.mark.parametrize("intensity", ["before", "after"])
 @pytest.mark.parametrize("normals", [0, 3])
-def test_intensities_like_colours_beside_colours(tmp_path: Path, intensity: str, normals: int) -> None:
+def test_intensities_like_colours_beside_colours(
+    tmp_path: Path, intensity: str, normals: int
+) -> None:
     """Channels of colours vary together, and reflected light does not with them."""
     xyz, rng = RNG.uniform(-5, 5, (300, 3)).round(3), np.random.default_rng(5)
     rgb = np.clip(rng.integers(0, 256, (300, 1)) + rng.integers(-30, 31, (300, 3)), 1, 255)
@@ -78,7 +80,10 @@ HEADED = {
     "CloudCompare": ("//X Y Z Rf Gf Bf", "{x} {y} {z} {rf} {gf} {bf}"),
     "Color_R": ("x,y,z,Color_R,Color_G,Color_B", "{x},{y},{z},{r},{g},{b}"),
     "quotes": ('"x","y","z","r","g","b"', '"{x}","{y}","{z}","{r}","{g}","{b}"'),
-    "words": ("label,x,y,z,time,red,green,blue", "ground,{x},{y},{z},2024-05-01T12:00:00,{r},{g},{b}"),
+    "words": (
+        "label,x,y,z,time,red,green,blue",
+        "ground,{x},{y},{z},2024-05-01T12:00:00,{r},{g},{b}",
+    ),
     "empty": ("x,y,z,intensity,red,green,blue,class", "{x},{y},{z},,{r},{g},{b},"),
     "empty, tabs": ("x\ty\tz\ti\tr\tg\tb", "{x}\t{y}\t{z}\t\t{r}\t{g}\t{b}"),
     "NULL": ("x,y,z,intensity,red,green,blue", "{x},{y},{z},NULL,{r},{g},{b}"),
@@ -101,7 +106,13 @@ def rows_of(form: str) -> list[str]:
     for i, ((x, y, z), (r, g, b)) in enumerate(zip(XYZ.tolist(), RGB.tolist(), strict=True)):
         packed = r << 16 | g << 8 | b
         values = {"x": f"{x:.3f}", "y": f"{y:.3f}", "z": f"{z:.3f}", "r": r, "g": g, "b": b, "i": i}
-        values |= {"rf": r / 255, "gf": g / 255, "bf": b / 255, "wide": 300 + 50 * i, "packed": packed}
+        values |= {
+            "rf": r / 255,
+            "gf": g / 255,
+            "bf": b / 255,
+            "wide": 300 + 50 * i,
+            "packed": packed,
+        }
         rows.append(form.format(**values, bits=f"{np.uint32(packed).view(np.float32):.9g}"))
     return rows
 
@@ -126,7 +137,9 @@ def test_several_scans_in_a_table(tmp_path: Path, between: str) -> None:
     is_cloud(tmp_path / "a.pts")
 
 
-@pytest.mark.parametrize("suffix", ["xyz", "xyzrgb", "xyzi", "xyzn", "neu", "pts", "csv", "tsv", "dat"])
+@pytest.mark.parametrize(
+    "suffix", ["xyz", "xyzrgb", "xyzi", "xyzn", "neu", "pts", "csv", "tsv", "dat"]
+)
 def test_suffixes_of_tables(tmp_path: Path, suffix: str) -> None:
     is_cloud(written(tmp_path / f"a.{suffix}", [XYZ, RGB]))
 
@@ -134,7 +147,10 @@ def test_suffixes_of_tables(tmp_path: Path, suffix: str) -> None:
 @pytest.mark.parametrize(
     ("text", "says"),
     [
-        ("Rouge,Vert,Bleu,X,Y,Z\n1,2,3,4,5,6\n7,8,9,1,2,3\n", "found columns x y z rouge vert bleu"),
+        (
+            "Rouge,Vert,Bleu,X,Y,Z\n1,2,3,4,5,6\n7,8,9,1,2,3\n",
+            "found columns x y z rouge vert bleu",
+        ),
         ("x,y,z,r,g,b\n1,2,3,4,5,6\n1,2,3,4,5,six\n", "'six'"),
         ("a,b\n1,2\n3,4\n", "no table of points: has 2 columns without a heading of x, y and z"),
     ],
@@ -148,15 +164,19 @@ def test_tables_that_cannot_be_read_say_why(tmp_path: Path, text: str, says: str
 def test_intensities_are_grey(tmp_path: Path) -> None:
     found = read_cloud(written(tmp_path / "a.pts", [XYZ, GREY], top="40\n"))
     assert [note.code for note in found.notes] == ["grey"]
-    assert (np.argsort(found.points.colors[:, 0], kind="stable") == np.argsort(GREY[:, 0], kind="stable"))[
-        2:-2
-    ].all()
+    assert (
+        np.argsort(found.points.colors[:, 0], kind="stable")
+        == np.argsort(GREY[:, 0], kind="stable")
+    )[2:-2].all()
 
 
 @pytest.mark.parametrize(
-    ("columns", "says"), [([XYZ], "no colours"), ([XYZ, GREY, GREY], "columns"), ([XYZ, XYZ - 9], "columns")]
+    ("columns", "says"),
+    [([XYZ], "no colours"), ([XYZ, GREY, GREY], "columns"), ([XYZ, XYZ - 9], "columns")],
 )
-def test_columns_that_are_not_colours_are_named(tmp_path: Path, columns: list[np.ndarray], says: str) -> None:
+def test_columns_that_are_not_colours_are_named(
+    tmp_path: Path, columns: list[np.ndarray], says: str
+) -> None:
     with pytest.raises(InputError, match=says):
         read_cloud(written(tmp_path / "a.xyz", columns))
 
@@ -167,7 +187,9 @@ def test_pcd(tmp_path: Path, how: str, rgb: str) -> None:
     packed = (RGB[:, 0] << 16 | RGB[:, 1] << 8 | RGB[:, 2]).astype("<u4")
     names = ["r", "g", "b"] if rgb == "apart" else ["rgb"]
     kinds = {"F": "<f4", "U": "<u4", "apart": "u1"}[rgb]
-    rows = np.zeros(40, [(n, "<f8") for n in "xyz"] + [("normal", "<f4", 3)] + [(n, kinds) for n in names])
+    rows = np.zeros(
+        40, [(n, "<f8") for n in "xyz"] + [("normal", "<f4", 3)] + [(n, kinds) for n in names]
+    )
     for i, axis in enumerate("xyz"):
         rows[axis] = XYZ[:, i]
     for i, name in enumerate(names):
@@ -178,7 +200,9 @@ def test_pcd(tmp_path: Path, how: str, rgb: str) -> None:
     head += f"COUNT 1 1 1 3{' 1' * len(names)}\nWIDTH 40\nHEIGHT 1\n"
     head += f"VIEWPOINT 0 0 0 1 0 0 0\nPOINTS 40\nDATA {how}\n"
     text = "\n".join(" ".join(f"{v:.9g}" for v in np.hstack([*row.item()])) for row in rows)
-    (tmp_path / "a.pcd").write_bytes(head.encode() + (rows.tobytes() if how == "binary" else text.encode()))
+    (tmp_path / "a.pcd").write_bytes(
+        head.encode() + (rows.tobytes() if how == "binary" else text.encode())
+    )
     is_cloud(tmp_path / "a.pcd")
     (tmp_path / "a.pcd").write_bytes((head + "1 2").encode())
     with pytest.raises(InputError, match=r"a\.pcd: "):
@@ -203,7 +227,9 @@ def trajectory(path: Path, times: list[str]) -> Path:
         w = np.sqrt(max(1e-12, 1 + np.trace(world[:3, :3]))) / 2
         R = world[:3, :3]
         xyz = np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]]) / (4 * w)
-        lines.append(" ".join([time, *map(repr, [*world[:3, 3].tolist(), *xyz.tolist(), float(w)])]))
+        lines.append(
+            " ".join([time, *map(repr, [*world[:3, 3].tolist(), *xyz.tolist(), float(w)])])
+        )
     path.write_text("\n".join(lines) + "\n")
     return path
 

@@ -40,7 +40,8 @@ def test_cameras_json(tmp_path: Path) -> None:
         assert (found.cameras.widths[0], found.cameras.heights[0]) == (80, 61)
         assert found.cameras.image_paths == (None,) * 10
         assert found.splits == ()
-    assert read_view_set(path, split="test").cameras.names == ("000", "008")  # those INRIA's --eval held out
+    # those INRIA's --eval held out
+    assert read_view_set(path, split="test").cameras.names == ("000", "008")
 
 
 def test_cameras_json_with_photos(tmp_path: Path) -> None:
@@ -79,7 +80,8 @@ def test_a_run_moves_its_data_s_cameras(tmp_path: Path) -> None:
         for view, pose in zip(found.cameras.viewmats, POSES, strict=True):
             np.testing.assert_allclose(view, trained(pose), atol=1e-9)
         assert found.cameras.Ks[0].tolist() == [[10, 0, 4.5], [0, 11, 2.5], [0, 0, 1]]
-    point = np.array([0.3, -0.2, 0.1, 1.0])  # of the saved world: falls on the same pixel after the move
+    # of the saved world: falls on the same pixel after the move
+    point = np.array([0.3, -0.2, 0.1, 1.0])
     moved = T @ point
     moved[:3] *= SCALE
     before, after = POSES[3] @ point, found.cameras.viewmats[3] @ moved
@@ -94,13 +96,18 @@ def test_a_run_s_own_split(tmp_path: Path, mode: str, test: set[int]) -> None:
     """fraction: 9 of 10 are ⌊linspace(0, 9, 9)⌋ = 0 … 7, 9."""
     data_of(tmp_path)
     found = read_view_set(run_of(tmp_path, mode=mode))
-    assert found.splits == (tuple("test" if i in test else "train" for i in range(10)) if test else ())
+    assert found.splits == (
+        tuple("test" if i in test else "train" for i in range(10)) if test else ()
+    )
 
 
 def test_a_run_s_data_state_their_split(tmp_path: Path) -> None:
     names = [f"images/{i:03d}.png" for i in range(10)]
     path = data_of(
-        tmp_path, train_filenames=names[3:], val_filenames=["./images/000.png"], test_filenames=names[1:3]
+        tmp_path,
+        train_filenames=names[3:],
+        val_filenames=["./images/000.png"],
+        test_filenames=names[1:3],
     )
     stated = ("val", "test", "test", *["train"] * 7)
     assert read_view_set(run_of(tmp_path)).splits == stated
@@ -113,7 +120,9 @@ def test_a_run_s_data_state_their_split(tmp_path: Path) -> None:
 def test_a_run_with_an_odd_split(tmp_path: Path) -> None:
     data_of(tmp_path)
     run = run_of(tmp_path, mode="interval")
-    (run / "config.yml").write_text((run / "config.yml").read_text().replace("interval: 4", "interval: 0"))
+    (run / "config.yml").write_text(
+        (run / "config.yml").read_text().replace("interval: 4", "interval: 0")
+    )
     with pytest.raises(InputError, match=r"invalid split in the run's config.yml"):
         read_view_set(run)
 
@@ -137,7 +146,9 @@ def test_a_run_with_its_data_elsewhere_and_optimised_poses(tmp_path: Path) -> No
         run = run_of(tmp_path / str(i), data=data, manager=manager, optimizer="SO3xR3")
         found = read_view_set(run)
         np.testing.assert_allclose(found.cameras.viewmats[0], trained(POSES[0]), atol=1e-9)
-        assert [note.code for note in found.notes if note.code != "no_photos"] == ["optimised_poses"]
+        assert [note.code for note in found.notes if note.code != "no_photos"] == [
+            "optimised_poses"
+        ]
 
 
 @pytest.mark.parametrize(
@@ -157,7 +168,9 @@ def test_a_run_that_was_copied_with_its_data(tmp_path: Path, kind_: str, parts: 
         read_view_set(run)
 
 
-@pytest.mark.parametrize("root", ["C:\\nerf\\data\\garden", "/home/me/data/garden", "D:/data/garden"])
+@pytest.mark.parametrize(
+    "root", ["C:\\nerf\\data\\garden", "/home/me/data/garden", "D:/data/garden"]
+)
 def test_a_result_folder_that_was_copied_with_its_data(tmp_path: Path, root: str) -> None:
     colmap(tmp_path / "data" / "garden", POSES, text=True)
     path = result_of(tmp_path, data_dir=root)
@@ -168,7 +181,9 @@ def test_a_run_without_config_takes_the_transforms_beside(tmp_path: Path) -> Non
     path = data_of(tmp_path)
     beside = path.parent / "dataparser_transforms.json"
     beside.write_text(json.dumps({"transform": (T @ A)[:3].tolist(), "scale": SCALE * APPLIED}))
-    np.testing.assert_allclose(read_view_set(beside).cameras.viewmats[1], trained(POSES[1]), atol=1e-9)
+    np.testing.assert_allclose(
+        read_view_set(beside).cameras.viewmats[1], trained(POSES[1]), atol=1e-9
+    )
     path.unlink()
     with pytest.raises(InputError, match=r"neither config\.yml nor transforms\.json"):
         read_view_set(beside)
@@ -211,9 +226,14 @@ def test_exported_cameras_take_intrinsics_from_their_data(tmp_path: Path) -> Non
     assert found.splits == ("train",) * 7 + ("test",) * 3
     for view, name in zip(found.cameras.viewmats, found.cameras.names, strict=True):
         np.testing.assert_allclose(view, trained(POSES[int(name[:3])]), atol=1e-9)
-    assert found.cameras.Ks[0].tolist() == [[5, 0, 2.25], [0, 5.5, 1.25], [0, 0, 1]]  # of 8×6 photos, halved
+    # of 8×6 photos, halved
+    assert found.cameras.Ks[0].tolist() == [[5, 0, 2.25], [0, 5.5, 1.25], [0, 0, 1]]
     assert (found.cameras.widths[0], found.cameras.heights[0]) == (4, 3)
-    assert read_view_set(out / "transforms_eval.json").cameras.names == ("000.png", "001.png", "002.png")
+    assert read_view_set(out / "transforms_eval.json").cameras.names == (
+        "000.png",
+        "001.png",
+        "002.png",
+    )
 
 
 def test_exported_cameras_without_data_are_refused(tmp_path: Path) -> None:
@@ -271,7 +291,14 @@ def test_settings(tmp_path: Path) -> None:
     ]
     (tmp_path / "a.yml").write_text("\n".join(lines))
     found = read_settings(tmp_path / "a.yml")
-    assert [found.word(key) for key in "abcfgz"] == ["x y", "a long value", None, None, "true", None]
+    assert [found.word(key) for key in "abcfgz"] == [
+        "x y",
+        "a long value",
+        None,
+        None,
+        "true",
+        None,
+    ]
     assert found.path("a") == Path("x y")
     block = found.block("d")
     assert (block[1].word("e"), block[1].word("g")) == ("1", None)

@@ -70,7 +70,10 @@ def test_a_fisheye_of_more_terms_is_refused(tmp_path: Path) -> None:
     ("content", "message"),
     [
         ("", "not JSON"),
-        *((content, "is a JSON list, but not") for content in ("[1]", "[]", "[1, 2]", '[{"a": 1}]')),
+        *(
+            (content, "is a JSON list, but not")
+            for content in ("[1]", "[]", "[1, 2]", '[{"a": 1}]')
+        ),
         *((content, "neither") for content in ("{}", '{"views": 3}')),
         ('{"views": []}', "'format' is None"),
     ],

@@ -22,7 +22,9 @@ from helpers.commands import CommandLine, refused, succeeds
 from helpers.peers import adobe_spz, splat_transform
 
 UTM = np.array([500_123.0, 6_600_456.0, 40.0])
-NAMES = ["scene/meta.json" if name == "folder" else f"scene.{name}" for name in (*FORMATS, "folder")]
+NAMES = [
+    "scene/meta.json" if name == "folder" else f"scene.{name}" for name in (*FORMATS, "folder")
+]
 
 
 def tower(count: int = 300) -> Splats:
@@ -94,7 +96,8 @@ def test_other_programs_see_a_scan_upright(tmp_path: Path, name: str) -> None:
         for one in (read, as_stored(replace(scan(), offset=np.zeros(3))))
     )
     assert np.abs(np.sort(seen, axis=0) - np.sort(expected, axis=0)).max() < 0.05
-    above = seen[:, 1] < -0.5  # y is down in what a .ply holds, and every other format is read to it
+    # y is down in what a .ply holds, and every other format is read to it
+    above = seen[:, 1] < -0.5
     assert 50 < above.sum() < 200  # of 300 of the mast
     assert seen[above, 0].min() > 2  # the mast is in the east: not mirrored
     assert seen[above, 2].min() > 2  # and in the north
@@ -102,7 +105,9 @@ def test_other_programs_see_a_scan_upright(tmp_path: Path, name: str) -> None:
 
 @pytest.mark.parametrize("offset", [UTM, (0, 0, 0)], ids=["map", "local"])
 @pytest.mark.parametrize("name", NAMES)
-def test_every_format_gives_a_scan_back_where_it_was(tmp_path: Path, name: str, offset: Any) -> None:
+def test_every_format_gives_a_scan_back_where_it_was(
+    tmp_path: Path, name: str, offset: Any
+) -> None:
     given = scan(offset)
     read = read_back(saved(tmp_path / name, given), given)
     assert read.axes == "RFU"
@@ -113,13 +118,16 @@ def test_every_format_gives_a_scan_back_where_it_was(tmp_path: Path, name: str, 
         np.testing.assert_allclose(read.shN[rows], given.shN[others], atol=1e-6)
         np.testing.assert_allclose(read.scales[rows], given.scales[others], rtol=1e-5)
         dots = np.abs((read.quats[rows] * given.quats[others]).sum(1))
-        lengths = np.linalg.norm(read.quats[rows], axis=1) * np.linalg.norm(given.quats[others], axis=1)
+        lengths = np.linalg.norm(read.quats[rows], axis=1) * np.linalg.norm(
+            given.quats[others], axis=1
+        )
         np.testing.assert_allclose(dots, lengths, rtol=1e-5)
 
 
 def test_a_ply_gives_back_every_bit(tmp_path: Path) -> None:
     given = scan().with_sh_degree(0)
-    given = g2ard.load(saved(tmp_path / "a.ply", given))  # unit quaternions, scales of their logarithms
+    # unit quaternions, scales of their logarithms
+    given = g2ard.load(saved(tmp_path / "a.ply", given))
     read = g2ard.load(saved(tmp_path / "b.ply", given))
     for name in ("means", "quats", "scales", "logit_opacities", "sh0", "offset"):
         np.testing.assert_array_equal(getattr(read, name), getattr(given, name), err_msg=name)
@@ -137,7 +145,9 @@ def test_every_spz_gives_a_scan_back(tmp_path: Path, version: int, axes: str) ->
 @pytest.mark.parametrize("name", ["scene.spz", "scene.splat"])
 def test_positions_of_a_map_fit_half_floats(tmp_path: Path, name: str) -> None:
     """Also of a scene whose float32 means are far from the origin, without an offset."""
-    for number, far in enumerate((scan(), replace(tower(), means=tower().means + np.float32([7e4, 0, 0])))):
+    for number, far in enumerate(
+        (scan(), replace(tower(), means=tower().means + np.float32([7e4, 0, 0])))
+    ):
         path = saved(tmp_path / f"{number}{name}", far)
         assert np.abs(plain(path).means).max() < 65_504
         assert np.abs(spread(read_back(path, far)) - spread(far)).max() < 0.02
@@ -152,13 +162,16 @@ def test_trained_scenes_are_written_as_they_were(tmp_path: Path, name: str) -> N
     assert np.abs(spread(g2ard.load(path)) - spread(given)).max() < 0.02
 
 
-def test_a_splat_of_a_map_says_how_to_put_it_back(command_line: CommandLine, tmp_path: Path) -> None:
+def test_a_splat_of_a_map_says_how_to_put_it_back(
+    command_line: CommandLine, tmp_path: Path
+) -> None:
     g2ard.save(tmp_path / "a.ply", scan())
     _, said = succeeds(command_line, tmp_path, "convert", "a.ply", "a.splat")
     line = next(line for line in said.splitlines() if "cannot state map coordinates" in line)
     command = line.split("`g2ard ")[1].split("`")[0].replace("OUT.ply", "back.ply").split()
     succeeds(command_line, tmp_path, *command)
-    assert np.abs(spread(g2ard.load(tmp_path / "back.ply")) - spread(scan())).max() < 0.5  # of float32
+    # of float32
+    assert np.abs(spread(g2ard.load(tmp_path / "back.ply")) - spread(scan())).max() < 0.5
 
 
 def test_axes_of_a_scan_can_be_had_again(command_line: CommandLine, tmp_path: Path) -> None:
@@ -166,12 +179,23 @@ def test_axes_of_a_scan_can_be_had_again(command_line: CommandLine, tmp_path: Pa
     g2ard.save(tmp_path / "a.ply", scan())
     local = replace(scan(), offset=np.zeros(3))
     for name, axes in (("z-up", "RFU"), ("y-up", "RUB"), ("RDF", "RDF")):
-        succeeds(command_line, tmp_path, "convert", "a.ply", f"{axes}.ply", "--to-axes", name, "--recentre")
+        succeeds(
+            command_line,
+            tmp_path,
+            "convert",
+            "a.ply",
+            f"{axes}.ply",
+            "--to-axes",
+            name,
+            "--recentre",
+        )
         read = g2ard.load(tmp_path / f"{axes}.ply")
         expected = worlds(local) @ change_of_axes("RFU", axes).T
         assert read.axes == "RDF"
         assert np.abs(np.sort(worlds(read), axis=0) - np.sort(expected, axis=0)).max() < 1e-4
-    line = refused(command_line, tmp_path, "convert", "a.ply", "b.ply", "--from-axes", "RFU", status=1)
+    line = refused(
+        command_line, tmp_path, "convert", "a.ply", "b.ply", "--from-axes", "RFU", status=1
+    )
     assert "names its axes" in line
 
 
@@ -186,7 +210,9 @@ def write_las(path: Path, shift: Any = (0.0, 0.0, 0.0)) -> None:
     las.write(path)
 
 
-def test_results_of_a_cloud_stand_upright_in_every_command(command_line: CommandLine, tmp_path: Path) -> None:
+def test_results_of_a_cloud_stand_upright_in_every_command(
+    command_line: CommandLine, tmp_path: Path
+) -> None:
     write_las(tmp_path / "map.las", UTM)
     run = partial(succeeds, command_line, tmp_path)
     run("lift", "map.las", "-o", "lift.ply")
@@ -197,7 +223,18 @@ def test_results_of_a_cloud_stand_upright_in_every_command(command_line: Command
     run("simplify", "tiles", "-r", "4", "--no-views", "-o", "tiled.ply")
     run("distill", "map.las", "-r", "4", "--steps", "3", "--size", "64", "-o", "run")
     run("distill", "tiles", "-r", "4", "--steps", "3", "--size", "64", "-o", "tiled_run")
-    run("recover", "small.ply", "--teacher", "lift.ply", "--steps", "3", "--size", "64", "-o", "more.ply")
+    run(
+        "recover",
+        "small.ply",
+        "--teacher",
+        "lift.ply",
+        "--steps",
+        "3",
+        "--size",
+        "64",
+        "-o",
+        "more.ply",
+    )
     run("clean", "lift.ply", "-o", "clean.ply")
     box = ",".join(str(v) for corner in ((-6, -6, -1), (3, 3, 1)) for v in UTM + corner)
     run("convert", "lift.ply", f"--box={box}", "-o", "crop.spz")

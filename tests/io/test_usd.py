@@ -28,8 +28,12 @@ def scene(degree: int = 3, offset: tuple[float, float, float] = (0, 0, 0)) -> Sp
 
 def attributes(path: Path) -> dict[str, np.ndarray]:
     """Parse the numbers of a .usda with one prim."""
-    lines = re.findall(r"^    (?:uniform )?(?!uniform)(\S+) (\S+) = (.*)$", path.read_text(), re.MULTILINE)
-    return {name: np.array(ast.literal_eval(v), float) for kind, name, v in lines if "token" not in kind}
+    lines = re.findall(
+        r"^    (?:uniform )?(?!uniform)(\S+) (\S+) = (.*)$", path.read_text(), re.MULTILINE
+    )
+    return {
+        name: np.array(ast.literal_eval(v), float) for kind, name, v in lines if "token" not in kind
+    }
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
@@ -78,10 +82,15 @@ def test_a_stage_with_z_up_and_a_turned_parent_looks_the_same(tmp_path: Path) ->
     truth = scene(3)
     write_splats(tmp_path / "a.usda", truth)
     text = (tmp_path / "a.usda").read_text().replace('upAxis = "Y"', 'upAxis = "Z"')
-    turn = "    double xformOp:rotateX = 90\n" + '    uniform token[] xformOpOrder = ["xformOp:rotateX"]\n'
+    turn = (
+        "    double xformOp:rotateX = 90\n"
+        + '    uniform token[] xformOpOrder = ["xformOp:rotateX"]\n'
+    )
     (tmp_path / "b.usda").write_text(text.rstrip().rstrip("}") + turn + "}\n")
     camera = Camera.facing([0.5, 0.3, -6], [0, 0, 0], width=64, height=64, fov=50)
-    wanted, got = (Renderer(s).render(camera).image for s in (truth, read_splats(tmp_path / "b.usda")))
+    wanted, got = (
+        Renderer(s).render(camera).image for s in (truth, read_splats(tmp_path / "b.usda"))
+    )
     np.testing.assert_allclose(got, wanted, atol=1e-4)
 
 
@@ -91,7 +100,9 @@ def prims(folder: Path, *fields: str, world: str = "") -> Path:
     return folder / "b.usda"
 
 
-def prim(folder: Path, name: str, truth: Splats, more: str = "", word: str = "def", meta: str = "") -> str:
+def prim(
+    folder: Path, name: str, truth: Splats, more: str = "", word: str = "def", meta: str = ""
+) -> str:
     write_splats(folder / "one.usda", truth, overwrite=True)
     body = (folder / "one.usda").read_text().partition("\n{\n")[2].rstrip().removesuffix("}")
     return f'{word} ParticleField3DGaussianSplat "{name}" {meta}\n{{\n{body}{more}}}\n'
@@ -110,7 +121,9 @@ HIDDEN = 'token visibility = "invisible"\n'
 def test_all_visible_prims_are_joined(tmp_path: Path, count: int, hidden: int) -> None:
     pytest.importorskip("pxr")
     parts = [scene(k) for k in range(count)]
-    text = [prim(tmp_path, f"p{k}", part, op("translate", 4 * k, 0, 0)) for k, part in enumerate(parts)]
+    text = [
+        prim(tmp_path, f"p{k}", part, op("translate", 4 * k, 0, 0)) for k, part in enumerate(parts)
+    ]
     text += [prim(tmp_path, f"h{k}", scene(1), HIDDEN) for k in range(hidden)]
     found = read_scene(prims(tmp_path, *text))
     assert [note.code for note in found.notes] == ["invisible_prims"] * hidden
@@ -143,11 +156,16 @@ def test_instances_and_the_earliest_time_are_read(tmp_path: Path) -> None:
     np.testing.assert_allclose(read_splats(prims(tmp_path, text)).means, truth.means, atol=1e-6)
 
 
-@pytest.mark.parametrize("space", ["lin_rec709_scene", "lin_rec2020_scene", "linear", "srgb_rec709_scene"])
+@pytest.mark.parametrize(
+    "space", ["lin_rec709_scene", "lin_rec2020_scene", "linear", "srgb_rec709_scene"]
+)
 @pytest.mark.parametrize("of", ["prim", "parent", "colours"])
 def test_linear_colours_are_noted(tmp_path: Path, space: str, of: str) -> None:
     pytest.importorskip("pxr")
-    named, api = f'uniform token colorSpace:name = "{space}"\n', '( prepend apiSchemas = ["ColorSpaceAPI"] )'
+    named, api = (
+        f'uniform token colorSpace:name = "{space}"\n',
+        '( prepend apiSchemas = ["ColorSpaceAPI"] )',
+    )
     text = prim(tmp_path, "a", scene(1), *([named, "def", api] if of == "prim" else []))
     if of == "parent":
         text = f'def Xform "p" {api}\n{{\n{named}{text}}}\n'

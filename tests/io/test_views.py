@@ -16,7 +16,9 @@ from helpers.view_files import edit, views
 
 @settings(max_examples=20, deadline=None)
 @given(count=st.integers(1, 12), seed=st.integers(0, 1000))
-def test_own_views_round_trip(tmp_path_factory: pytest.TempPathFactory, count: int, seed: int) -> None:
+def test_own_views_round_trip(
+    tmp_path_factory: pytest.TempPathFactory, count: int, seed: int
+) -> None:
     path = tmp_path_factory.mktemp("views") / "a.json"
     truth = views(count, seed)
     write_views(path, truth)

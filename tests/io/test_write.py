@@ -71,7 +71,9 @@ def test_equal_scenes_give_equal_bytes_on_any_threads(tmp_path: Path, name: str)
 def test_odd_scenes(tmp_path: Path, name: str) -> None:
     one = Splats.create([[1.0, 2, 3]], scales=[[0.1, 0.2, 0.3]], quats=[[0, 0, 0, 0]])
     far = 16 if name == "ply" else np.inf  # .ply refuses infinities
-    same = Splats.create(np.ones((9, 3)), scales=np.zeros((9, 3)), logit_opacities=[far, -far, *[0] * 7])
+    same = Splats.create(
+        np.ones((9, 3)), scales=np.zeros((9, 3)), logit_opacities=[far, -far, *[0] * 7]
+    )
     for splats in (one, same, one.with_sh_degree(3)):
         path = tmp_path / f"{len(list(tmp_path.iterdir()))}"
         path.mkdir()
@@ -95,12 +97,18 @@ def test_unwritable_values_are_one_line(tmp_path: Path, name: str) -> None:
 def test_packing_reports_its_progress(tmp_path: Path, name: str) -> None:
     """Telling changes no byte; the last call says that all is done."""
     scene, told = checkered_ball(5000), []
-    for folder, how in (("quiet", {}), ("told", {"progress": lambda *report: told.append(report[:3])})):
+    for folder, how in (
+        ("quiet", {}),
+        ("told", {"progress": lambda *report: told.append(report[:3])}),
+    ):
         (tmp_path / folder / "a").mkdir(parents=True)
         write_splats(tmp_path / folder / name, scene, overwrite=True, **how)
     files = [path for path in (tmp_path / "told").rglob("*") if path.is_file()]
     for path in files:
-        assert path.read_bytes() == (tmp_path / "quiet" / path.relative_to(tmp_path / "told")).read_bytes()
+        assert (
+            path.read_bytes()
+            == (tmp_path / "quiet" / path.relative_to(tmp_path / "told")).read_bytes()
+        )
     (stage, done, total), counts = told[-1], [report[1] for report in told]
     assert files
     assert done == total > 1, stage
@@ -130,7 +138,9 @@ def test_offsets_are_kept(tmp_path: Path, name: str) -> None:
     utm = (443_000.0, 5_411_000.5, 120.25)
     splats = replace(scene(300, 1), offset=np.array(utm))
     if name == "splat":
-        with pytest.warns(UserWarning, match=r"--translate=443000,5411000\.5,120\.25` puts them back"):
+        with pytest.warns(
+            UserWarning, match=r"--translate=443000,5411000\.5,120\.25` puts them back"
+        ):
             found = read_splats(saved(tmp_path, name, splats))
         np.testing.assert_allclose(found.means.mean(0), splats.means.mean(0), atol=1e-3)
         near = replace(splats, offset=np.array([3.0, 4, 5]))
@@ -170,7 +180,8 @@ def test_sog(tmp_path: Path, name: str, degree: int) -> None:
     if degree:
         assert meta["shN"]["count"] == 512 == palette_size(700)
         spread = ((truth.shN - truth.shN.mean(0)) ** 2).sum()
-        assert ((found.shN - truth.shN) ** 2).sum() < 0.35 * spread  # 512 entries for 700 random rows
+        # 512 entries for 700 random rows
+        assert ((found.shN - truth.shN) ** 2).sum() < 0.35 * spread
 
 
 @pytest.mark.parametrize("version", [2, 3, 4])
@@ -180,7 +191,8 @@ def test_spz(tmp_path: Path, version: int, degree: int) -> None:
     path = saved(tmp_path, "spz", truth, spz_version=version)
     found = read_splats(path)
     fine = np.percentile(np.sort(truth.scales, axis=1)[:, 1], 1)
-    np.testing.assert_allclose(found.means, truth.means, atol=fine / 8 + 1e-6)  # half of a step of fine / 4
+    # half of a step of fine / 4
+    np.testing.assert_allclose(found.means, truth.means, atol=fine / 8 + 1e-6)
     np.testing.assert_allclose(found.log_scales, truth.log_scales, atol=0.5 / 16 + 1e-5)
     np.testing.assert_allclose(found.opacities, truth.opacities, atol=0.5 / 255 + 1e-6)
     np.testing.assert_allclose(found.sh0, truth.sh0, atol=0.5 / 255 / 0.15 + 1e-6)
@@ -242,23 +254,29 @@ def with_far(count: int, times: float, unit: float, seed: int, around: int = 400
     away = [rng.uniform(0, 1, 4000), np.exp(rng.uniform(1, 4, around)), np.full(count, times)]
     means = (ways * np.concatenate(away)[:, None] * unit)[rng.permutation(len(ways))]
     sizes = 0.02 * unit * rng.uniform(0.5, 2, (len(ways), 3))
-    return Splats.create(means.astype(np.float32), scales=sizes, logit_opacities=np.full(len(ways), 2.0))
+    return Splats.create(
+        means.astype(np.float32), scales=sizes, logit_opacities=np.full(len(ways), 2.0)
+    )
 
 
 @pytest.mark.parametrize("name", ["compressed.ply", "sog", "spz", "glb", "splat"])
 @pytest.mark.parametrize(
-    ("count", "times", "unit"), [(1, 3e3, 1.0), (10, 3e3, 0.02), (10, 100.0, 30.0), (300, 1000.0, 1.0)]
+    ("count", "times", "unit"),
+    [(1, 3e3, 1.0), (10, 3e3, 0.02), (10, 100.0, 30.0), (300, 1000.0, 1.0)],
 )
 def test_far_rows_leave_the_others_precise(
     tmp_path: Path, name: str, count: int, times: float, unit: float
 ) -> None:
     """Positions of three quarters of the rows keep 60 dB of the ball's size."""
     truth = with_far(count, times, unit, seed=count)
-    found = read_splats(saved(tmp_path, name, truth, **({"compress": "spz"} if name == "glb" else {})))
+    found = read_splats(
+        saved(tmp_path, name, truth, **({"compress": "spz"} if name == "glb" else {}))
+    )
     near = truth.means[np.linalg.norm(truth.means, axis=1) < 0.8 * unit]
     near, stored = near[::10].astype(float), found.means.astype(float)
     off = np.linalg.norm(near[:, None] - stored, axis=2).min(axis=1)
-    steps = {"spz": 2.0**-12, "glb": 2.0**-12, "sog": 2 * np.log1p(times * unit) / 65535}  # of all rows
+    # of all rows
+    steps = {"spz": 2.0**-12, "glb": 2.0**-12, "sog": 2 * np.log1p(times * unit) / 65535}
     assert np.sqrt((off**2).mean()) < max(1e-3 * unit, 2 * steps.get(name, 0.0))
 
 
@@ -280,7 +298,9 @@ def test_packing_order_keeps_shells_apart(seed: int, chunk: int) -> None:
 
 
 @pytest.mark.parametrize("name", ["a.spz", "a.glb"])
-@pytest.mark.parametrize(("count", "times", "shift"), [(1, 1e6, 0.0), (10, 3e5, -40.0), (600, 1e7, 7.0)])
+@pytest.mark.parametrize(
+    ("count", "times", "shift"), [(1, 1e6, 0.0), (10, 3e5, -40.0), (600, 1e7, 7.0)]
+)
 def test_what_is_too_far_for_an_spz_is_named_with_a_box(
     tmp_path: Path, name: str, count: int, times: float, shift: float
 ) -> None:
@@ -288,7 +308,9 @@ def test_what_is_too_far_for_an_spz_is_named_with_a_box(
     truth = with_far(count, times, 1.0, seed=count)
     truth = replace(truth, means=truth.means + np.float32(shift))
     first = np.flatnonzero(np.abs(truth.means).max(1) > 1e5)[0]
-    with pytest.raises(InputError, match=rf"{count} Gaussians? of .* \(row {first}\b.*--box=") as error:
+    with pytest.raises(
+        InputError, match=rf"{count} Gaussians? of .* \(row {first}\b.*--box="
+    ) as error:
         write_splats(tmp_path / name, truth, **options)
     box = [float(v) for v in re.search(r"--box=([-\d.,]+\d)", str(error.value))[1].split(",")]
     cropped = convert(truth, box=box)
@@ -332,13 +354,19 @@ def test_glb_loses_nothing_but_roundings(tmp_path: Path, degree: int) -> None:
 def test_codebook_is_the_best_there_is() -> None:
     """Every cut of the sorted values, in float64, by the textbook's O(K·n²)."""
     rng = np.random.default_rng(3)
-    for values in (rng.normal(size=60), rng.exponential(size=60), rng.integers(0, 9, 60).astype(float)):
+    for values in (
+        rng.normal(size=60),
+        rng.exponential(size=60),
+        rng.integers(0, 9, 60).astype(float),
+    ):
         values = np.sort(values.astype(np.float32)).astype(float)
         n, count = len(values), 7
         error = lambda i, j: ((values[i:j] - values[i:j].mean()) ** 2).sum()  # noqa: B023, E731
         best = [error(0, j) if j else 0.0 for j in range(n + 1)]
         for _ in range(count - 1):
-            best = [min([best[j], *(best[i] + error(i, j) for i in range(1, j))]) for j in range(n + 1)]
+            best = [
+                min([best[j], *(best[i] + error(i, j) for i in range(1, j))]) for j in range(n + 1)
+            ]
         book = _core.codebook(values.astype(np.float32), count)
         found = ((values - book[nearest(book, values.astype(np.float32))]) ** 2).sum()
         assert found == pytest.approx(best[n], rel=1e-5, abs=1e-9)
@@ -390,7 +418,9 @@ def test_glb_keeps_the_rules(tmp_path: Path) -> None:
         assert view["byteLength"] == 321 * width * dtype.itemsize
         assert view["byteOffset"] + view["byteLength"] <= len(binary)
         assert ("normalized" in accessor) == (dtype.itemsize == 2)
-        arrays[name] = np.frombuffer(binary, dtype, 321 * width, view["byteOffset"]).reshape(321, width)
+        arrays[name] = np.frombuffer(binary, dtype, 321 * width, view["byteOffset"]).reshape(
+            321, width
+        )
         if name == "POSITION":
             assert accessor["min"] == arrays[name].min(0).tolist()
             assert accessor["max"] == arrays[name].max(0).tolist()
@@ -399,8 +429,12 @@ def test_glb_keeps_the_rules(tmp_path: Path) -> None:
     shown = np.clip(truth.colors, 0, 1).astype(float)
     linear = np.where(shown <= 0.04045, shown / 12.92, ((shown + 0.055) / 1.055) ** 2.4)
     np.testing.assert_allclose(arrays["COLOR_0"][:, :3] / 65535, linear, atol=0.5 / 65535 + 1e-6)
-    np.testing.assert_allclose(arrays["COLOR_0"][:, 3] / 65535, truth.opacities, atol=0.5 / 65535 + 1e-6)
-    np.testing.assert_allclose(np.linalg.norm(arrays[f"{EXTENSION}:ROTATION"], axis=1), 1, atol=1e-6)
+    np.testing.assert_allclose(
+        arrays["COLOR_0"][:, 3] / 65535, truth.opacities, atol=0.5 / 65535 + 1e-6
+    )
+    np.testing.assert_allclose(
+        np.linalg.norm(arrays[f"{EXTENSION}:ROTATION"], axis=1), 1, atol=1e-6
+    )
     assert (arrays[f"{EXTENSION}:OPACITY"] <= 1).all()
     assert sum(name.startswith(f"{EXTENSION}:SH_DEGREE_") for name in arrays) == 16
 
@@ -450,7 +484,9 @@ def test_khronos_validator_finds_no_error(tmp_path: Path, options: dict[str, str
     ours = f"/meshes/0/primitives/0/attributes/{EXTENSION}:"  # names that only the extension allows
     found = [m for m in report["issues"]["messages"] if m["severity"] < 2]
     left = [
-        m for m in found if not (m["code"].endswith("INVALID_ATTRIBUTE") and m["pointer"].startswith(ours))
+        m
+        for m in found
+        if not (m["code"].endswith("INVALID_ATTRIBUTE") and m["pointer"].startswith(ours))
     ]
     assert not left
 
@@ -467,8 +503,12 @@ def test_glb_with_spz_holds_gltf_coordinates(tmp_path: Path, degree: int) -> Non
     (primitive,) = document["meshes"][0]["primitives"]
     splatting = primitive["extensions"][EXTENSION]
     assert splatting["extensions"][SPZ_EXTENSION] == {"bufferView": 0}
-    assert document["extensionsRequired"] == document["extensionsUsed"] == [EXTENSION, SPZ_EXTENSION]
-    accessors = {name: document["accessors"][index] for name, index in primitive["attributes"].items()}
+    assert (
+        document["extensionsRequired"] == document["extensionsUsed"] == [EXTENSION, SPZ_EXTENSION]
+    )
+    accessors = {
+        name: document["accessors"][index] for name, index in primitive["attributes"].items()
+    }
     assert {accessor["count"] for accessor in accessors.values()} == {700}
     assert sum("SH_DEGREE" in name for name in accessors) == (degree + 1) ** 2 - 1
     assert document["nodes"][0]["matrix"][12:15] == [-443_000.0, -5_411_000.5, 120.25]
@@ -505,7 +545,9 @@ def test_nodes_of_a_glb_turn_scale_and_move(tmp_path: Path, compress: str | None
     got, want = (covariances(s.quats, s.scales) for s in (found, wanted))
     np.testing.assert_allclose(got, want, rtol=1e-4, atol=1e-6)
     np.testing.assert_allclose(found.shN, wanted.shN, atol=1e-5)
-    write_glb(path, {**document, "nodes": [document["nodes"][0], above | {"scale": [1, 2, 1]}]}, binary)
+    write_glb(
+        path, {**document, "nodes": [document["nodes"][0], above | {"scale": [1, 2, 1]}]}, binary
+    )
     uneven = read_splats(path)
     moved = turn @ cycle @ np.diag([0.5, 1, 0.5, 1]) @ turn
     linear, shift = moved[:3, :3], moved[:3, 3]
@@ -526,14 +568,18 @@ STORED = {"ROTATION": "quats", "SCALE": "scales", "OPACITY": "opacities"}
         *(("OPACITY", dtype) for dtype in ("u1", "<u2")),
     ],
 )
-def test_attributes_of_a_glb_may_be_normalised_integers(tmp_path: Path, name: str, dtype: str) -> None:
+def test_attributes_of_a_glb_may_be_normalised_integers(
+    tmp_path: Path, name: str, dtype: str
+) -> None:
     path = saved(tmp_path, "glb", replace(scene(90, 1), scales=np.full((90, 3), 0.3, np.float32)))
     plain = read_splats(path)
     document, binary = glb_parts(path)
     attributes = document["meshes"][0]["primitives"][0]["attributes"]
     accessor = document["accessors"][attributes[f"{EXTENSION}:{name}"]]
     view = document["bufferViews"][accessor["bufferView"]]
-    floats = np.frombuffer(binary, "<f4", view["byteLength"] // 4, view["byteOffset"]).reshape(90, -1)
+    floats = np.frombuffer(binary, "<f4", view["byteLength"] // 4, view["byteOffset"]).reshape(
+        90, -1
+    )
     codes = np.rint(floats * np.iinfo(dtype).max).astype(dtype)
     rows = np.zeros((90, 12), "u1")
     rows[:, : codes.itemsize * codes.shape[1]] = codes.view("u1").reshape(90, -1)
@@ -547,8 +593,12 @@ def test_attributes_of_a_glb_may_be_normalised_integers(tmp_path: Path, name: st
         np.testing.assert_allclose(getattr(found, field), getattr(plain, field), atol=step)
 
 
-@pytest.mark.parametrize(("name", "options"), [("a.spz", {}), ("a.glb", {"compress": "spz"}), ("a.glb", {})])
-def test_a_large_spz_is_noted(monkeypatch: pytest.MonkeyPatch, name: str, options: dict[str, str]) -> None:
+@pytest.mark.parametrize(
+    ("name", "options"), [("a.spz", {}), ("a.glb", {"compress": "spz"}), ("a.glb", {})]
+)
+def test_a_large_spz_is_noted(
+    monkeypatch: pytest.MonkeyPatch, name: str, options: dict[str, str]
+) -> None:
     monkeypatch.setattr("g2ard.io.scene_formats.LARGEST_SPZ", 19)
     ball = checkered_ball(20)
     codes = [note.code for note in lost_in(name, ball, **options)]

@@ -39,7 +39,9 @@ def fast(splats: Splats, count: int) -> Splats:
 
 def test_bytes_too_few_for_a_gaussian_in_tiles() -> None:
     with pytest.raises(InputError, match=r"a\.ply: 100 bytes are too few"):
-        find_count_for_bytes(checkered_ball(9), 100, "a.ply", partial(fast, checkered_ball(9)), total=6000)
+        find_count_for_bytes(
+            checkered_ball(9), 100, "a.ply", partial(fast, checkered_ball(9)), total=6000
+        )
 
 
 def test_a_small_file_of_a_format_with_a_head_takes_few_trials() -> None:
@@ -54,7 +56,9 @@ def test_a_small_file_of_a_format_with_a_head_takes_few_trials() -> None:
     assert len(tried) <= 6
 
 
-def test_a_file_that_fills_nearly_all_bytes_ends_the_search(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_file_that_fills_nearly_all_bytes_ends_the_search(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """98 % do, 97 % do not; here every trial has the same size."""
     for most, last in ((98.0, 1), (97.0, 6)):
         tried: list[int] = []
@@ -125,7 +129,9 @@ def test_simplify_fits(tmp_path: Path, command_line: CommandLine) -> None:
 @pytest.mark.parametrize("recovered", [False, True])
 def test_quest3_bounds_overdraw(recovered: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     scene, said = checkered_ball(3000), []
-    reduce = Reduction(InMemory(scene), GivenViews(say=said.append), blind=True, recovered=recovered)
+    reduce = Reduction(
+        InMemory(scene), GivenViews(say=said.append), blind=True, recovered=recovered
+    )
     plain = reduce.resolve(Budget(fit="quest3"), "a", "a.ply")
     assert plain.count == reduce.resolve(Budget(fit="web"), "a", "a.ply").count == 3000
     dense = close_up(scene)
@@ -136,18 +142,27 @@ def test_quest3_bounds_overdraw(recovered: bool, monkeypatch: pytest.MonkeyPatch
     assert near is not None
     assert dense["mean"] / 4 < near["mean"] <= dense["mean"] / 1.3
     assert f"at {found:,}" in " ".join(said)
-    monkeypatch.setitem(LAYERS, "quest3", 1e-3)  # out of reach: the search ends, and says what it has
+    # out of reach: the search ends, and says what it has
+    monkeypatch.setitem(LAYERS, "quest3", 1e-3)
     assert reduce.resolve(Budget(fit="quest3"), "a", "a.ply").count < found
 
 
 @pytest.mark.parametrize(
     "settings",
-    [{"method": "fast"}, {"method": "paper"}, {"method": "default"}, {"keep_region": ((0, 0, 1, 0.5),)}],
+    [
+        {"method": "fast"},
+        {"method": "paper"},
+        {"method": "default"},
+        {"keep_region": ((0, 0, 1, 0.5),)},
+    ],
 )
 def test_distill_measures_the_simplification_that_it_makes(settings: dict[str, Any]) -> None:
     said: list[str] = []
-    settings = {"steps": 1, "focus": "far", **settings}  # no views of other kinds, which take longest
-    options = DistillOptions(views=around(16, (48, 36)), size=48, settings=settings, say=said.append)
+    # no views of other kinds, which take longest
+    settings = {"steps": 1, "focus": "far", **settings}
+    options = DistillOptions(
+        views=around(16, (48, 36)), size=48, settings=settings, say=said.append
+    )
     job = prepare(checkered_ball(800), Budget(min_psnr=24), options)
     judged = job.budget.judge(job.run().simplified)
     assert judged is not None
@@ -185,7 +200,9 @@ def test_decibels_are_of_the_file(tmp_path: Path, command_line: CommandLine) -> 
     for name in ("b.ply", "b.splat"):
         told = succeeds(command_line, tmp_path, *ask, "24", "-o", name).err
         counts[name] = len(read_splats(tmp_path / name))
-        assert told.splitlines()[-1].endswith(" in the 12 views that chose the count; requested: 24.00 dB")
+        assert told.splitlines()[-1].endswith(
+            " in the 12 views that chose the count; requested: 24.00 dB"
+        )
     assert counts["b.splat"] > counts["b.ply"]
     code, _, told = command_line(*ask, "90", "-o", "c.splat", cwd=tmp_path)
     assert code == 3
@@ -196,15 +213,30 @@ def test_decibels_are_of_the_file(tmp_path: Path, command_line: CommandLine) -> 
 BALL = checkered_ball(400)
 
 
-@pytest.mark.parametrize(("name", "value"), [("ratio", [5, 10]), ("count", (9, 8)), ("min_psnr", "high")])
+@pytest.mark.parametrize(
+    ("name", "value"), [("ratio", [5, 10]), ("count", (9, 8)), ("min_psnr", "high")]
+)
 def test_a_budget_is_one_number(name: str, value: object) -> None:
-    words = f"{name}: expected " + ("a number or none, got 'high'" if value == "high" else "one value, got ")
+    words = f"{name}: expected " + (
+        "a number or none, got 'high'" if value == "high" else "one value, got "
+    )
     with pytest.raises(InputError, match=f"^{words}"):
         g2ard.distill(BALL, **{name: value})  # type: ignore[arg-type]
 
 
 def test_several_budgets_equal_single_runs(command_line: CommandLine, folder: Path) -> None:
-    several = ("simplify", "ball.ply", "-r", "4,5", "-r", 10, "-o", "s_{ratio}x_{count}.ply", "--json", "-")
+    several = (
+        "simplify",
+        "ball.ply",
+        "-r",
+        "4,5",
+        "-r",
+        10,
+        "-o",
+        "s_{ratio}x_{count}.ply",
+        "--json",
+        "-",
+    )
     out = succeeds(command_line, folder, *several).out
     assert [run["output_count"] for run in json.loads(out)["runs"]] == [100, 80, 40]
     for ratio, count in ((4, 100), (5, 80), (10, 40)):
@@ -215,7 +247,13 @@ def test_several_budgets_equal_single_runs(command_line: CommandLine, folder: Pa
 
 @pytest.mark.parametrize(
     ("text", "counts"),
-    [("1,000", [1000]), ("1_100", [1100]), ("300", [300]), ("0.2k,10%", [200, 120]), ("200,100", [200, 100])],
+    [
+        ("1,000", [1000]),
+        ("1_100", [1100]),
+        ("300", [300]),
+        ("0.2k,10%", [200, 120]),
+        ("200,100", [200, 100]),
+    ],
 )
 def test_counts_take_separators(text: str, counts: list[int]) -> None:
     assert [count.budget().of(1200) for count in Counts.parse(text)] == counts

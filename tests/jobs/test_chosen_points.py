@@ -122,26 +122,42 @@ def test_tiles_hold_the_chosen_points(tmp_path: Path) -> None:
     assert stores[0].key != stores[1].key
 
 
-def test_every_command_that_lifts_takes_the_choice(tmp_path: Path, command_line: CommandLine) -> None:
+def test_every_command_that_lifts_takes_the_choice(
+    tmp_path: Path, command_line: CommandLine
+) -> None:
     path = tmp_path / "cloud.las"
     _, classes, _ = _cloud(path)
-    ground, choice = int((classes == 2).sum()), ("--where", "classification == 2", "--color", "intensity")
+    ground, choice = (
+        int((classes == 2).sum()),
+        ("--where", "classification == 2", "--color", "intensity"),
+    )
     succeeds(command_line, tmp_path, "lift", path, "-o", "a.ply", *choice)
     succeeds(command_line, tmp_path, "convert", path, "b.ply", *choice)
-    succeeds(command_line, tmp_path, "simplify", path, "-n", ground, "--no-views", "-o", "c.ply", *choice)
+    succeeds(
+        command_line, tmp_path, "simplify", path, "-n", ground, "--no-views", "-o", "c.ply", *choice
+    )
     scenes = [g2ard.load(tmp_path / f"{name}.ply") for name in "abc"]
     assert [len(scene) for scene in scenes] == [ground] * 3
     larger = succeeds(command_line, tmp_path, "convert", path, "larger.ply").err
     assert "smaller: g2ard convert larger.ply larger.sog" in larger
     np.testing.assert_array_equal(scenes[0].means, scenes[1].means)
     words = ("-n", 20, "--steps", 1, "--size", 32, "--no-page", "-o", "run")
-    assert f"{ground:,} points → 20" in succeeds(command_line, tmp_path, "distill", path, *words, *choice).err
+    assert (
+        f"{ground:,} points → 20"
+        in succeeds(command_line, tmp_path, "distill", path, *words, *choice).err
+    )
     words = ("-r", "1,4", "--merge-only", "--size", 32, "--dry-run")
     assert (
-        f"{round(ground / 4)} Gaussians" in succeeds(command_line, tmp_path, "lod", path, *words, *choice).err
+        f"{round(ground / 4)} Gaussians"
+        in succeeds(command_line, tmp_path, "lod", path, *words, *choice).err
     )
-    assert f"{ground:,} rows" in succeeds(command_line, tmp_path, "ingest", path, "--dry-run", *choice).err
-    np.testing.assert_array_equal(g2ard.convert(path, where="classification == 2").means, scenes[0].means)
+    assert (
+        f"{ground:,} rows"
+        in succeeds(command_line, tmp_path, "ingest", path, "--dry-run", *choice).err
+    )
+    np.testing.assert_array_equal(
+        g2ard.convert(path, where="classification == 2").means, scenes[0].means
+    )
 
 
 @pytest.mark.parametrize(
@@ -149,7 +165,10 @@ def test_every_command_that_lifts_takes_the_choice(tmp_path: Path, command_line:
     [
         ("lift cloud.las -o a.ply --where 'classification == 9'", "classification is 2 to 6"),
         ("lift cloud.las -o a.ply --box 0,0,0,1,1,1", "none of 600 points is kept: x is 4"),
-        ("lift cloud.las -o a.ply --where 'class_ == 2'", "unknown name 'class_'; names are x, y, z"),
+        (
+            "lift cloud.las -o a.ply --where 'class_ == 2'",
+            "unknown name 'class_'; names are x, y, z",
+        ),
         ("lift bare.las -o a.ply --color class", "colours nothing: it is 0 at all points"),
         ("lift cloud.xyz -o a.ply --color class", "has no column 'classification'"),
         ("simplify ball.ply -r 2 -o a.ply --box 0,0,0,1,1,1", "`g2ard convert` crops scenes"),

@@ -30,7 +30,20 @@ from helpers.tiled_scenes import town_in
 
 
 def test_a_dry_run_counts_and_writes_nothing(folder: Path, command_line: CommandLine) -> None:
-    ask = ("distill", "ball.ply", "-r", "10", "-o", "run", "--steps", "12", "--size", "48", "--json", "-")
+    ask = (
+        "distill",
+        "ball.ply",
+        "-r",
+        "10",
+        "-o",
+        "run",
+        "--steps",
+        "12",
+        "--size",
+        "48",
+        "--json",
+        "-",
+    )
     before = set(folder.iterdir())
     out, error = succeeds(command_line, folder, *ask, "--dry-run")
     assert set(folder.iterdir()) == before
@@ -45,12 +58,27 @@ def test_a_dry_run_counts_and_writes_nothing(folder: Path, command_line: Command
 
 
 @pytest.mark.parametrize("scene", ["town.ply", "tiles"])
-def test_a_dry_run_plans_tiles_like_the_run(scene: str, tmp_path: Path, command_line: CommandLine) -> None:
+def test_a_dry_run_plans_tiles_like_the_run(
+    scene: str, tmp_path: Path, command_line: CommandLine
+) -> None:
     folder = town_in(tmp_path, 3000, views=4)
     words = ("ingest", "town.ply", "-o", "tiles", "--tile-rows", 800)
     store = [] if scene == "town.ply" else succeeds(command_line, folder, *words)
     before = sorted(folder.rglob("*"))
-    ask = ("distill", scene, "-r", 10, "--views", "views.json", "--size", 24, "--steps", 2, "--json", "-")
+    ask = (
+        "distill",
+        scene,
+        "-r",
+        10,
+        "--views",
+        "views.json",
+        "--size",
+        24,
+        "--steps",
+        2,
+        "--json",
+        "-",
+    )
     ask += ("--focus", "far")
     ask += ("--workers", 1) if store else ("--workers", 1, "--tile-rows", 800)
     told = json.loads(succeeds(command_line, folder, *ask, "--dry-run").out)
@@ -63,9 +91,22 @@ def test_a_dry_run_plans_tiles_like_the_run(scene: str, tmp_path: Path, command_
 
 
 @pytest.mark.parametrize("rows", [(), ("--tile-rows", 800, "--workers", 1)])
-def test_a_dry_run_of_simplify(rows: tuple[object, ...], tmp_path: Path, command_line: CommandLine) -> None:
+def test_a_dry_run_of_simplify(
+    rows: tuple[object, ...], tmp_path: Path, command_line: CommandLine
+) -> None:
     folder = town_in(tmp_path, 3000, views=4)
-    ask = ("simplify", "town.ply", "-r", "10,20", "--views", "views.json", *rows, "--dry-run", "--json", "-")
+    ask = (
+        "simplify",
+        "town.ply",
+        "-r",
+        "10,20",
+        "--views",
+        "views.json",
+        *rows,
+        "--dry-run",
+        "--json",
+        "-",
+    )
     plans = json.loads(succeeds(command_line, folder, *ask).out)["runs"]
     assert [plan["count"] for plan in plans] == [300, 150]
     assert {plan["views"] for plan in plans} == {2}
@@ -76,12 +117,25 @@ def test_a_dry_run_of_simplify(rows: tuple[object, ...], tmp_path: Path, command
 
 def test_a_dry_run_of_levels_plans_tiles(tmp_path: Path, command_line: CommandLine) -> None:
     folder = town_in(tmp_path, 3000, views=4)
-    ask = ("lod", "town.ply", "-r", "1,4,8", "--views", "views.json", "--size", 24, "--tile-rows", 800)
+    ask = (
+        "lod",
+        "town.ply",
+        "-r",
+        "1,4,8",
+        "--views",
+        "views.json",
+        "--size",
+        24,
+        "--tile-rows",
+        800,
+    )
     out, said = succeeds(command_line, folder, *ask, "--steps", 90, "--dry-run", "--json", "-")
     found = [(one["level"], one["count"], one["steps"]) for one in json.loads(out)["levels"]]
     assert found == [(1, 750, 90), (2, 375, 90)]
     assert "4 tiles of 3,000 Gaussians" in said
-    assert "200 MB" in refused(command_line, folder, *ask, "--dry-run", "--memory", "200MB", status=1)
+    assert "200 MB" in refused(
+        command_line, folder, *ask, "--dry-run", "--memory", "200MB", status=1
+    )
     assert {path.name for path in folder.iterdir()} == {"town.ply", "views.json"}
 
 
@@ -146,7 +200,9 @@ MEASURED = {
 def measured(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with scenes of random harmonics, 24 views and some photos."""
     folder, rng = tmp_path_factory.mktemp("measured"), np.random.default_rng(0)
-    for name in {word for ask in MEASURED.values() for word in ask.split() if word.endswith(".ply")}:
+    for name in {
+        word for ask in MEASURED.values() for word in ask.split() if word.endswith(".ply")
+    }:
         count, degree = map(int, name.removesuffix(".ply").split("_"))
         harmonics = rng.normal(0, 0.15, (count, (degree + 1) ** 2 - 1, 3)).astype(np.float32)
         g2ard.save(folder / name, replace(checkered_ball(count), shN=harmonics))
@@ -156,10 +212,18 @@ def measured(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="memory cannot be read on this system")
+@pytest.mark.skipif(
+    not Path("/proc/self/status").exists(), reason="memory cannot be read on this system"
+)
 @pytest.mark.parametrize("name", MEASURED)
-def test_memory_is_close(name: str, measured: Path, tmp_path: Path, command_line: CommandLine) -> None:
-    ask = [*MEASURED[name].split(), "-o", tmp_path / ("run" if "distill" in MEASURED[name] else "out.ply")]
+def test_memory_is_close(
+    name: str, measured: Path, tmp_path: Path, command_line: CommandLine
+) -> None:
+    ask = [
+        *MEASURED[name].split(),
+        "-o",
+        tmp_path / ("run" if "distill" in MEASURED[name] else "out.ply"),
+    ]
     ask += ["--device", "cpu", "--threads", "2"]  # a software adapter takes memory
     told = json.loads(succeeds(command_line, measured, *ask, "--dry-run", "--json", "-").out)
     (told,) = told.get("runs", [told])
@@ -207,13 +271,17 @@ def test_a_dry_run_needs_no_output(budget: str, folder: Path, command_line: Comm
     assert set(folder.iterdir()) == before
 
 
-def test_a_dry_run_of_clean_is_of_the_kinds_requested(folder: Path, command_line: CommandLine) -> None:
+def test_a_dry_run_of_clean_is_of_the_kinds_requested(
+    folder: Path, command_line: CommandLine
+) -> None:
     def planned(*only: str) -> dict[str, Any]:
         ask = ("clean", "ball.ply", *only, "--dry-run", "--json", "-")
         told: dict[str, Any] = json.loads(succeeds(command_line, folder, *ask).out)
         return told
 
-    nothing, giants, whole = (planned(*only) for only in (["--only", "none"], ["--only", "giant"], []))
+    nothing, giants, whole = (
+        planned(*only) for only in (["--only", "none"], ["--only", "giant"], [])
+    )
     assert nothing["views"] == 0
     assert nothing["bytes"] < giants["bytes"]
     assert giants["views"] == whole["views"] > 0
@@ -228,9 +296,21 @@ def test_a_dry_run_of_clean_is_of_the_kinds_requested(folder: Path, command_line
 @pytest.mark.parametrize("command", ["recover", "adapt"])
 def test_a_dry_run_of_a_fit(command: str, folder: Path, command_line: CommandLine) -> None:
     before = set(folder.iterdir())
-    ask = (command, "ball.ply", "--views", "views.json", "--teacher", "ball.ply", "--steps", 4, "--json", "-")
+    ask = (
+        command,
+        "ball.ply",
+        "--views",
+        "views.json",
+        "--teacher",
+        "ball.ply",
+        "--steps",
+        4,
+        "--json",
+        "-",
+    )
     told = json.loads(succeeds(command_line, folder, *ask, "--dry-run").out)
     assert set(folder.iterdir()) == before
     ran = json.loads(succeeds(command_line, folder, *ask, "-o", "fit.ply").out)
     assert told["count"] == len(g2ard.load(folder / "fit.ply"))
-    assert (told["steps"], ran["steps"]) == ((4, 4) if command == "adapt" else (0, 0))  # it is its teacher
+    # it is its teacher
+    assert (told["steps"], ran["steps"]) == ((4, 4) if command == "adapt" else (0, 0))

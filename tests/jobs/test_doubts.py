@@ -22,7 +22,9 @@ UNDER_SKY = under_sky(YARD, 0.35, 500.0, -0.1)
 
 def looking(eyes: list[tuple[float, float, float]], fov: float = 50.0) -> Cameras:
     """Return views at the yard."""
-    return Cameras.of([Camera.facing(e, [0, 0, 0.5], fov=fov, name=f"{i}") for i, e in enumerate(eyes)])
+    return Cameras.of(
+        [Camera.facing(e, [0, 0, 0.5], fov=fov, name=f"{i}") for i, e in enumerate(eyes)]
+    )
 
 
 @pytest.fixture(scope="module")

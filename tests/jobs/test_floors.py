@@ -34,7 +34,9 @@ def layers(count: int = 15_000) -> Splats:
     towards = rng.normal(size=(count, 3))
     towards /= np.linalg.norm(towards, axis=1, keepdims=True)
     x, y, z = towards.T
-    radii = (1 + 0.12 * np.sin(5 * x) * np.sin(4 * y) * np.sin(6 * z)) * (1 - 0.2 * rng.random(count) ** 1.5)
+    radii = (1 + 0.12 * np.sin(5 * x) * np.sin(4 * y) * np.sin(6 * z)) * (
+        1 - 0.2 * rng.random(count) ** 1.5
+    )
     colors = pattern(towards) + rng.normal(0, 0.04, (count, 3))
     size = 1.2 * np.sqrt(4 * np.pi / count)
     return Splats.create(
@@ -55,7 +57,9 @@ def lifted(count: int = 15_000) -> Splats:
     points = rng.uniform(-1, 1, (count, 3))
     block, within = np.divmod(2.5 * points[:, :2], 1)
     roof = 0.08 + 0.12 * np.abs(np.sin(block @ [3, 5]))
-    points[:, 2] = np.where((np.abs(within - 0.5) < 0.28).all(1), roof, 0.03 * np.sin(4 * points[:, 0]))
+    points[:, 2] = np.where(
+        (np.abs(within - 0.5) < 0.28).all(1), roof, 0.03 * np.sin(4 * points[:, 0])
+    )
     return lift(points, np.clip(pattern(points) + rng.normal(0, 0.05, (count, 3)), 0, 1))
 
 
@@ -68,7 +72,9 @@ def views(scene: str) -> dict[str, list[Camera]]:
     spots = np.stack([0.6 * np.cos(3 * step), 0.6 * np.sin(5 * step), np.full(6, 0.1)], 1)
     close = sides if scene == "layers" else spots
     return {
-        "far": [Camera.facing(4 * side, [0, 0, 0], width=160, height=160, fov=45) for side in sides],
+        "far": [
+            Camera.facing(4 * side, [0, 0, 0], width=160, height=160, fov=45) for side in sides
+        ],
         "near": [
             Camera.facing(spot + 0.7 * side, spot, width=400, height=400, fov=45)
             for spot, side in zip(close, sides, strict=True)
@@ -79,7 +85,9 @@ def views(scene: str) -> dict[str, list[Camera]]:
 @pytest.mark.parametrize(("scene", "growth"), FLOORS)
 def test_a_tenth_of_the_gaussians_looks_as_good_as_before(scene: str, growth: float | None) -> None:
     dense = {"layers": layers, "lifted": lifted}[scene]()
-    small = g2ard.simplify(dense, ratio=10, settings={} if growth is None else {"max_growth": growth}).splats
+    small = g2ard.simplify(
+        dense, ratio=10, settings={} if growth is None else {"max_growth": growth}
+    ).splats
     before, after = Renderer(dense), Renderer(small)
     reached = {
         name: float(np.mean([psnr(after.clipped(view), before.clipped(view)) for view in some]))

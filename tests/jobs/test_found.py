@@ -36,13 +36,19 @@ def same(a: Path, b: Path) -> bool:
     return bool(np.array_equal(read_splats(a).means, read_splats(b).means))
 
 
-def test_simplify_looks_from_the_cameras_beside_the_model(command_line: CommandLine, folder: Path) -> None:
+def test_simplify_looks_from_the_cameras_beside_the_model(
+    command_line: CommandLine, folder: Path
+) -> None:
     for name, extra, words in (
         ("found", (), SAID),
         ("given", ("--views", "model/cameras.json"), ""),
         ("made", ("--views", "made"), ""),
         ("none", ("--no-views",), ""),
-        ("turned", ("--up", "0,-1,0"), SAID.replace("scene;", "scene; --up turns generated views only;")),
+        (
+            "turned",
+            ("--up", "0,-1,0"),
+            SAID.replace("scene;", "scene; --up turns generated views only;"),
+        ),
         ("fast", ("--method", "fast"), ""),
         ("looking", ("--method", "fast", "--views", "made"), ""),
     ):
@@ -66,7 +72,9 @@ def test_distill_trains_and_scores_on_them(command_line: CommandLine, folder: Pa
     assert held_out == {"000", "008"}  # every 8th by name
     assert set(report["views"]["chosen"]) == {f"{i:03d}" for i in range(16)} - held_out
     assert set(g2ard.load_views(folder / "run", split="test").names) == held_out
-    error = succeeds(command_line, folder, *DISTILL, "-o", "pool", "--size", 64, "--views", "made").err
+    error = succeeds(
+        command_line, folder, *DISTILL, "-o", "pool", "--size", 64, "--views", "made"
+    ).err
     assert SAID not in error
     assert len(read_view_set(folder / "pool" / "views.json").cameras) >= 20
 
@@ -74,10 +82,16 @@ def test_distill_trains_and_scores_on_them(command_line: CommandLine, folder: Pa
 def test_large_cameras_without_photos_are_shrunk(command_line: CommandLine, folder: Path) -> None:
     inria(folder / "model" / "cameras.json", EYES[:4], width=1200, height=900, fx=1050.0, fy=1050.0)
     write_views(folder / "small.json", read_view_set(folder / "model").cameras.resized(800))
-    for name, extra in (("found", ()), ("given", ("--views", "small.json")), ("full", ("--views", "model"))):
+    for name, extra in (
+        ("found", ()),
+        ("given", ("--views", "small.json")),
+        ("full", ("--views", "model")),
+    ):
         succeeds(command_line, folder, *SIMPLIFY, "-o", f"{name}.ply", *extra)
         if name != "full":
-            succeeds(command_line, folder, *DISTILL, "--focus", "far", "--no-page", "-o", name, *extra)
+            succeeds(
+                command_line, folder, *DISTILL, "--focus", "far", "--no-page", "-o", name, *extra
+            )
     assert same(folder / "found.ply", folder / "given.ply")
     assert not same(folder / "found.ply", folder / "full.ply")
     assert same(folder / "found" / "scene.ply", folder / "given" / "scene.ply")
@@ -114,7 +128,11 @@ def test_too_few_cameras_are_left(command_line: CommandLine, folder: Path) -> No
 
 def test_facing() -> None:
     K = [[50, 0, 32], [0, 50, 24], [0, 0, 1]]
-    eyes = [look_at([3, 0, 0], [0, 0, 0]), look_at([3, 0, 0], [9, 0, 0]), look_at([3, 0, 0], [3, 9, 0])]
+    eyes = [
+        look_at([3, 0, 0], [0, 0, 0]),
+        look_at([3, 0, 0], [9, 0, 0]),
+        look_at([3, 0, 0], [3, 9, 0]),
+    ]
     cameras = Cameras.from_lists(eyes, [K] * 3, [(64, 48)] * 3, "abc")
     assert cameras.facing([[0, 0, 0]]).tolist() == [True, False, False]
     assert cameras.facing([[0, 0, 0], [3, 5, 0]]).tolist() == [True, False, True]

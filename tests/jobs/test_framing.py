@@ -47,7 +47,9 @@ def test_a_subject_fills_the_window(size: tuple[float, float], aspect: float) ->
 
 @pytest.mark.parametrize("aspect", ASPECTS)
 def test_all_of_a_view_fits_into_the_window(aspect: float) -> None:
-    view = Camera.facing([0, -1, 0], [0, 0, 0], width=400, height=300, fov=2 * np.degrees(np.arctan(0.4)))
+    view = Camera.facing(
+        [0, -1, 0], [0, 0, 0], width=400, height=300, fov=2 * np.degrees(np.arctan(0.4))
+    )
     tall = half(choose_fields(view), aspect)
     assert max(0.4 / (tall * aspect), 0.3 / tall) == pytest.approx(1)
 

@@ -31,7 +31,9 @@ def test_views_are_made_where_none_are_given(command_line: CommandLine, folder: 
     assert not (folder / "renders").exists()
     assert (
         "1 image in renders"
-        in succeeds(command_line, folder, "render", "ball.ply", "-k", 1, "-o", "renders", "--size", 32).err
+        in succeeds(
+            command_line, folder, "render", "ball.ply", "-k", 1, "-o", "renders", "--size", 32
+        ).err
     )
     assert len(list((folder / "renders").iterdir())) == 1
     command_line("simplify", "ball.ply", "-r", 5, "-o", "small.ply", cwd=folder)
@@ -89,7 +91,9 @@ def test_runs_with_a_focus_are_scored_in_the_views_of_others(focus: str) -> None
     statue = naive.statue()
     plain, focused = (
         choose_views(
-            InMemory(statue), DistillOptions(views="made", settings={"focus": kind, "steps": 1400}), 300
+            InMemory(statue),
+            DistillOptions(views="made", settings={"focus": kind, "steps": 1400}),
+            300,
         )
         for kind in (None, focus)
     )
@@ -123,7 +127,9 @@ def test_given_views_stay_first(tmp_path: Path) -> None:
     statue = naive.statue()
     write_views(tmp_path / "views.json", plan_pool(statue, 16).cameras)
     views = [
-        choose_views(InMemory(statue), DistillOptions(views=tmp_path / "views.json", settings=settings), 500)
+        choose_views(
+            InMemory(statue), DistillOptions(views=tmp_path / "views.json", settings=settings), 500
+        )
         for settings in ({"focus": "far"}, {"focus": "anywhere", "focus_share": 0.25})
     ]
     plain, mixed = (found.train.cameras for found in views)
@@ -142,7 +148,10 @@ def test_crowded_views_have_their_weights_whatever_joins(crowded: int, focus: st
     def moved(viewmat: np.ndarray) -> np.ndarray:
         return viewmat + np.pad(rng.normal(0, 1e-3, (3, 1)), ((0, 1), (3, 0)))
 
-    crowd = [replace(pool[0], viewmat=moved(pool[0].viewmat), name=f"crowd_{row}") for row in range(crowded)]
+    crowd = [
+        replace(pool[0], viewmat=moved(pool[0].viewmat), name=f"crowd_{row}")
+        for row in range(crowded)
+    ]
     given = Cameras.of([*pool, *crowd])
 
     def found(focus: str | None, **settings: object) -> ViewSet:
@@ -170,7 +179,9 @@ def test_runs_of_few_steps_use_few_views() -> None:
     scene = naive.statue()
 
     def made(**recover: object) -> RunViews:
-        return choose_views(InMemory(scene), DistillOptions(views="made", settings=recover), len(scene) // 10)
+        return choose_views(
+            InMemory(scene), DistillOptions(views="made", settings=recover), len(scene) // 10
+        )
 
     whole, fast, few = made(schedule="best"), made(schedule="fast"), made(steps=20)
     counts = [len(views.train.cameras) for views in (whole, fast, few)]
@@ -185,7 +196,9 @@ def test_runs_of_few_steps_use_few_views() -> None:
     assert [len(views.validation or ()) for views in (whole, fast, few)] == [24, 12, 12]
 
 
-def test_a_few_views_are_scored_at_twice_their_size(command_line: CommandLine, folder: Path) -> None:
+def test_a_few_views_are_scored_at_twice_their_size(
+    command_line: CommandLine, folder: Path
+) -> None:
     ask = ("distill", "ball.ply", "-r", 4, "--steps", 20, "--size", 64, "-o", "run", "--no-page")
     told = json.loads(succeeds(command_line, folder, *ask, "--json", "-").out)
     kinds = {row["kind"]: row["views"] for row in told["kinds"]}

@@ -50,7 +50,9 @@ def stated(folder: Path, views: g2ard.Cameras) -> Split:
 def in_a_split_file(folder: Path, views: g2ard.Cameras) -> Split:
     write_views(folder / "views.json", views)
     train = [row for row in range(len(views)) if row not in HELD_OUT]
-    (folder / "split.json").write_text(json.dumps({"train": names_of(train), "test": names_of(HELD_OUT)}))
+    (folder / "split.json").write_text(
+        json.dumps({"train": names_of(train), "test": names_of(HELD_OUT)})
+    )
     return folder / "views.json", None, HELD_OUT
 
 
@@ -130,7 +132,9 @@ LEARNERS: dict[str, Callable[[Path, Path | None], Any]] = {
     "photos alone": distilled(None),
     "points along rays": distilled(None, count=120),
     "a cloud without colours": distilled(SCAN, count=90),
-    "a cloud with too few points": distilled(Points(SCAN.positions[:50], SCAN.colors[:50]), count=90),
+    "a cloud with too few points": distilled(
+        Points(SCAN.positions[:50], SCAN.colors[:50]), count=90
+    ),
     "a scene": distilled(BALL, count=90),
     "recover": lambda views, _: g2ard.recover(small(), views=views, steps=25),
     "simplify": lambda views, _: g2ard.simplify(BALL, count=90, views=views),
@@ -209,7 +213,9 @@ def _model(folder: Path, suffix: str, moved: bool) -> Path:
         file.write_bytes(data)
     else:
         lines = [
-            " ".join(map(str, [number, *map(float, xyz), *rgb, 0.5, *(f"{image} 0" for image in track)]))
+            " ".join(
+                map(str, [number, *map(float, xyz), *rgb, 0.5, *(f"{image} 0" for image in track)])
+            )
             for number, (xyz, rgb, track) in enumerate(points)
         ]
         file.write_text("\n".join(lines))
@@ -228,13 +234,17 @@ def test_points_that_held_out_photos_found_change_no_bit(
         folder = tmp_path / f"{moved}"
         points, held_out = _model(folder, suffix, moved), None
         if split == "stated":
-            (points.parent / "test.txt").write_text("\n".join(f"{name}.png" for name in names_of(HELD_OUT)))
+            (points.parent / "test.txt").write_text(
+                "\n".join(f"{name}.png" for name in names_of(HELD_OUT))
+            )
         else:
             held_out = folder / "scores.json"
             views = g2ard.load_views(folder)
             names = {f"{name}.png" for name in names_of(HELD_OUT)}
             write_views(held_out, views.take([name in names for name in views.names]))
-        done = g2ard.distill(points if given else None, views=folder, held_out=held_out, count=90, steps=3)
+        done = g2ard.distill(
+            points if given else None, views=folder, held_out=held_out, count=90, steps=3
+        )
         found.append(done.splats)
     assert_same_bits(*found)
 
@@ -244,7 +254,9 @@ def test_points_in_tiles_are_those_that_training_photos_found(tmp_path: Path) ->
     for moved in (False, True):
         folder = tmp_path / f"{moved}"
         points = _model(folder, ".bin", moved)
-        (points.parent / "test.txt").write_text("\n".join(f"{name}.png" for name in names_of(HELD_OUT)))
+        (points.parent / "test.txt").write_text(
+            "\n".join(f"{name}.png" for name in names_of(HELD_OUT))
+        )
         options = DistillOptions(views=folder, settings={"steps": 3})
         tiling = Tiling(100, workers=1, folder=folder / "work")
         with open_job(Source(points), Budget(count=90), options, tiling) as job:

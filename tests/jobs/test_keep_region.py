@@ -46,7 +46,9 @@ def test_views_count_as_if_they_stood_nearer() -> None:
     """A far camera counts like one at half the distance."""
     scene = g2ard.Splats.create([[0, 0, 0]], scales=np.full((1, 3), 0.05), logit_opacities=[3])
     far, near = (
-        g2ard.Cameras.of([g2ard.Camera.facing([0, -away, 0], [0, 0, 0], width=200, height=200, fov=30)])
+        g2ard.Cameras.of(
+            [g2ard.Camera.facing([0, -away, 0], [0, 0, 0], width=200, height=200, fov=30)]
+        )
         for away in (4.0, 2.0)
     )
     seen, nearer = (visibility_source(cameras)(scene) for cameras in (far, near))

@@ -63,7 +63,9 @@ def test_a_result_shows_its_held_out_score_at_the_views_own_size(results: dict[s
     views = VIEWS.take([VIEWS.names.index(name) for name in done.held_out.cameras.names])
     known = g2ard.evaluate(done, g2ard.TeacherRenders(BALL, views)).psnr
     width, height = VIEWS[0].width, VIEWS[0].height
-    held_out = f"PSNR {known:.2f} dB in 1 held-out view against the dense scene, {width}×{height} px"
+    held_out = (
+        f"PSNR {known:.2f} dB in 1 held-out view against the dense scene, {width}×{height} px"
+    )
     assert repr(done) == f"Distilled(60 Gaussians, {held_out})"
 
 
@@ -107,7 +109,9 @@ def test_every_report_is_a_line() -> None:
         for field in fields(cls):
             object.__setattr__(full, field.name, ["word"] * 500)
         if cls.__name__ not in own:
-            assert re.fullmatch(cls.__name__ + r"\(\w+=500 items(, \w+=500 items)*(, …)?\)", repr(full))
+            assert re.fullmatch(
+                cls.__name__ + r"\(\w+=500 items(, \w+=500 items)*(, …)?\)", repr(full)
+            )
             assert len(repr(full)) < 120
 
 
@@ -156,7 +160,9 @@ def test_paths_and_results_are_taken_for_scenes(tmp_path: Path, results: dict[st
     from_file = g2ard.render(tmp_path / "small.ply", VIEWS[0]).image
     np.testing.assert_allclose(from_file, expected, atol=1e-4)
     for wrong in (3, VIEWS, None):
-        with pytest.raises(g2ard.InputError, match="splats: expected Splats or a result with splats"):
+        with pytest.raises(
+            g2ard.InputError, match="splats: expected Splats or a result with splats"
+        ):
             g2ard.save(tmp_path / "wrong.ply", wrong)  # type: ignore[arg-type]
 
 
@@ -190,7 +196,9 @@ class Shell(SimpleNamespace):
         assert raw
         assert display_id
         self.cells.append([content["text/plain"]])
-        return SimpleNamespace(update=lambda content, raw: self.cells[-1].append(content["text/plain"]))
+        return SimpleNamespace(
+            update=lambda content, raw: self.cells[-1].append(content["text/plain"])
+        )
 
 
 def test_view_shows_the_whole_page_in_a_notebook(
@@ -218,7 +226,9 @@ def test_progress_is_one_line_per_cell(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     shell = Shell(monkeypatch)
-    monkeypatch.setattr("g2ard.progress.time", SimpleNamespace(monotonic=iter(range(1000, 2000, 2)).__next__))
+    monkeypatch.setattr(
+        "g2ard.progress.time", SimpleNamespace(monotonic=iter(range(1000, 2000, 2)).__next__)
+    )
     for cell in (1, 2):
         shell.execution_count = cell
         for stage in ("read", "recover"):
@@ -259,10 +269,14 @@ def test_words_that_people_try(results: dict[str, Any]) -> None:
         g2ard.distill(BALL, budget=50)
     assert len(g2ard.simplify(BALL, count="0.1k", blind=True).splats) == 100
     for wrong in ("50 percent", "1.5", "k"):
-        with pytest.raises(g2ard.InputError, match="count: expected a whole number, or text such as 50k"):
+        with pytest.raises(
+            g2ard.InputError, match="count: expected a whole number, or text such as 50k"
+        ):
             g2ard.simplify(BALL, count=wrong, blind=True)
     done = results["Distilled"]
-    assert g2ard.evaluate(done, done.held_out).psnr == g2ard.evaluate(done.splats, done.held_out).psnr
+    assert (
+        g2ard.evaluate(done, done.held_out).psnr == g2ard.evaluate(done.splats, done.held_out).psnr
+    )
 
 
 def test_cameras_show_a_few_frames() -> None:
@@ -272,9 +286,13 @@ def test_cameras_show_a_few_frames() -> None:
 def test_names_are_visible_without_running() -> None:
     """Editors read the imports for type checkers; jedi does unless their condition is literally false."""
     tree = ast.parse((ROOT / "g2ard" / "__init__.py").read_text(encoding="utf-8"))
-    assert not [n for n in tree.body if isinstance(n, ast.Assign) and ast.unparse(n.value) == "False"]
+    assert not [
+        n for n in tree.body if isinstance(n, ast.Assign) and ast.unparse(n.value) == "False"
+    ]
     block = next(node for node in tree.body if isinstance(node, ast.If))
-    imports = [alias.asname or alias.name for node in block.body for alias in getattr(node, "names", [])]
+    imports = [
+        alias.asname or alias.name for node in block.body for alias in getattr(node, "names", [])
+    ]
     assert set(imports) >= set(g2ard.__all__)
 
 
@@ -298,7 +316,10 @@ LENSES = {
 @pytest.mark.parametrize("lens", LENSES)
 def test_a_photo_or_mask_that_moved_is_named(lens: str, moved: str, tmp_path: Path) -> None:
     """Every reader reports it, through every lens."""
-    photo, mask = photo_file(tmp_path / "photo.png", (64, 48)), photo_file(tmp_path / "mask.png", (64, 48))
+    photo, mask = (
+        photo_file(tmp_path / "photo.png", (64, 48)),
+        photo_file(tmp_path / "mask.png", (64, 48)),
+    )
     views = replace(VIEWS, image_paths=(photo,) * 3, mask_paths=(mask,) * 3, **LENSES[lens])
     shown = g2ard.Photos(views)
     (tmp_path / f"{moved}.png").unlink()

@@ -13,7 +13,19 @@ from helpers.scenes import checkered_ball
 
 
 def test_distill_scores_the_packed_file(command_line: CommandLine, folder: Path) -> None:
-    ask = ("distill", "ball.ply", "-r", 4, "--steps", 20, "--size", 48, "--no-page", "--focus", "far")
+    ask = (
+        "distill",
+        "ball.ply",
+        "-r",
+        4,
+        "--steps",
+        20,
+        "--size",
+        48,
+        "--no-page",
+        "--focus",
+        "far",
+    )
     ask = (*ask, "--format", "splat")
     error = succeeds(command_line, folder, *ask, "-o", "run").err
     report = json.loads((folder / "run" / "report.json").read_text())
@@ -22,7 +34,10 @@ def test_distill_scores_the_packed_file(command_line: CommandLine, folder: Path)
     scores = f"{packed:.1f} dB in held-out views, {report['size']} ({unpacked:.1f} as .ply)"
     assert scored == f"scene.splat: 0.00 MB, {scores}"
     assert 10 < packed < unpacked
-    assert "dB in held-out views (" not in succeeds(command_line, folder, *ask[:-1], "ply", "-o", "plain").err
+    assert (
+        "dB in held-out views ("
+        not in succeeds(command_line, folder, *ask[:-1], "ply", "-o", "plain").err
+    )
 
 
 def test_a_costly_format_names_a_better_one() -> None:
@@ -38,9 +53,12 @@ def test_convert_warns_only_of_a_visible_loss(command_line: CommandLine, tmp_pat
     ball = checkered_ball(400)
     g2ard.save(tmp_path / "ball.ply", ball)
     for name in ("a.sog", "a.spz", "a.glb", "a.compressed.ply"):
-        assert "warning" not in succeeds(command_line, tmp_path, "convert", "ball.ply", name).err, name
+        assert "warning" not in succeeds(command_line, tmp_path, "convert", "ball.ply", name).err, (
+            name
+        )
     shiny = replace(ball, shN=np.random.default_rng(0).normal(size=(400, 15, 3)).astype(np.float32))
     g2ard.save(tmp_path / "shiny.ply", shiny)
-    error = succeeds(command_line, tmp_path, "convert", "shiny.ply", "b.splat").err  # .splat drops SH
+    # .splat drops SH
+    error = succeeds(command_line, tmp_path, "convert", "shiny.ply", "b.splat").err
     assert "warning: b.splat: renders are " in error
     assert "; .sog loses less, .ply nothing\n" in error

@@ -10,7 +10,9 @@ from helpers.scenes import checkered_ball
 
 def test_paint_keeps_geometry_and_shade() -> None:
     ball = checkered_ball(300)
-    found = paint(ball, np.where(np.arange(300)[:, None] < 100, [0.93, 0.33, 0.10], [0.55, 0.60, 0.66]))
+    found = paint(
+        ball, np.where(np.arange(300)[:, None] < 100, [0.93, 0.33, 0.10], [0.55, 0.60, 0.66])
+    )
     assert np.array_equal(found.means, ball.means)
     assert np.array_equal(found.logit_opacities, ball.logit_opacities)
     assert found.sh_degree == 0

@@ -48,13 +48,26 @@ def test_alpha_is_composited_over_the_background(command_line: CommandLine, rgba
 
 
 def test_a_run_is_drawn_on_its_own_background(command_line: CommandLine, rgba: Path) -> None:
-    made = ("distill", "--views", "ball", "-n", 300, "--steps", 5, "--background", "white", "--no-page")
+    made = (
+        "distill",
+        "--views",
+        "ball",
+        "-n",
+        300,
+        "--steps",
+        5,
+        "--background",
+        "white",
+        "--no-page",
+    )
     succeeds(command_line, rgba, *made, "-o", "run")
     told = succeeds(command_line, rgba, "evaluate", "run", "--views", "ball")
     assert "background: white, as run was made with" in told.err
     assert (
         told.out
-        == succeeds(command_line, rgba, "evaluate", "run", "--views", "ball", "--background", "white").out
+        == succeeds(
+            command_line, rgba, "evaluate", "run", "--views", "ball", "--background", "white"
+        ).out
     )
     for ask in (
         ("render", "run", "--orbit", 1, "-o", "pictures"),
@@ -113,7 +126,9 @@ def test_test_views_are_found_beside_the_training_views(rgba: Path) -> None:
     folder = rgba / "ball"
     found = read_view_set(folder / "transforms_train.json")
     assert (found.splits.count("train"), found.splits.count("test")) == (16, 8)
-    assert "transforms_test.json beside it has the test views" in [str(note) for note in found.notes]
+    assert "transforms_test.json beside it has the test views" in [
+        str(note) for note in found.notes
+    ]
     (folder / "transforms_test.json").unlink()
     alone = read_view_set(folder / "transforms_train.json")
     assert (len(alone.cameras), alone.splits) == (16, ())
@@ -130,7 +145,9 @@ def test_info_describes_the_photos(rgba: Path, tmp_path: Path) -> None:
     first, second = (tmp_path / "plain" / "images" / f"00{i}.png" for i in (0, 1))
     write_png(first, np.full((24, 32, 3), 0.5), overwrite=True)
     assert "23 photos of 64×48 pixels, 1 of other sizes" in notes(tmp_path / "plain")["mixed_sizes"]
-    opaque = np.concatenate([np.asarray(Image.open(second)), np.full((48, 64, 1), 255, np.uint8)], 2)
+    opaque = np.concatenate(
+        [np.asarray(Image.open(second)), np.full((48, 64, 1), 255, np.uint8)], 2
+    )
     Image.fromarray(opaque).save(second)
     assert measure_traits([second]).alpha == 0  # an alpha channel that hides nothing
 
@@ -181,17 +198,40 @@ def test_images_beside_cameras_json_are_found_and_fitted(tmp_path: Path) -> None
     assert not any(read_view_set(tmp_path / "toy").cameras.image_paths)
 
 
-def test_a_cloud_is_topped_up_from_photos_elsewhere(command_line: CommandLine, tmp_path: Path) -> None:
+def test_a_cloud_is_topped_up_from_photos_elsewhere(
+    command_line: CommandLine, tmp_path: Path
+) -> None:
     model(tmp_path / "toy", images="elsewhere")
     cloud_of(tmp_path / "toy" / "input.ply", BALL.take(np.arange(300)))
-    ask = ("distill", "toy/input.ply", "--views", "toy", "-n", 500, "--steps", 2, "--no-page", "--json", "-")
+    ask = (
+        "distill",
+        "toy/input.ply",
+        "--views",
+        "toy",
+        "-n",
+        500,
+        "--steps",
+        2,
+        "--no-page",
+        "--json",
+        "-",
+    )
     found = succeeds(command_line, tmp_path, *ask, "-o", "found").err
     assert "photos are in toy/elsewhere, not in toy/images" in found
     out, error = succeeds(command_line, tmp_path, *ask, "--images", "toy/elsewhere", "-o", "run")
     assert json.loads(out)["output_count"] == 500
     assert "starting from 300 sparse points and 200 points along camera rays" in error
-    _, error = succeeds(command_line, tmp_path, ask[0], *ask[2:], "--images", "toy/elsewhere", "-o", "alone")
+    _, error = succeeds(
+        command_line, tmp_path, ask[0], *ask[2:], "--images", "toy/elsewhere", "-o", "alone"
+    )
     assert "starting from 300 sparse points" in error  # input.ply belongs to the model
     assert "--images goes with --views" in refused(
-        command_line, tmp_path, "render", "toy/input.ply", "--images", "toy/elsewhere", "-o", "renders"
+        command_line,
+        tmp_path,
+        "render",
+        "toy/input.ply",
+        "--images",
+        "toy/elsewhere",
+        "-o",
+        "renders",
     )

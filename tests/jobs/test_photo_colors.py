@@ -17,7 +17,9 @@ from g2ard.stages.photo_points.colors import colored, median_colors
 def view(folder: Path, number: int, colour: tuple[int, int, int], eye: list[float]) -> Camera:
     path = folder / f"{number}.png"
     Image.new("RGB", (64, 48), colour).save(path)
-    return replace(Camera.facing(eye, [0, 0, 0], width=64, height=48, name=path.name), image_path=path)
+    return replace(
+        Camera.facing(eye, [0, 0, 0], width=64, height=48, name=path.name), image_path=path
+    )
 
 
 @pytest.mark.parametrize(("seed", "every"), [(0, None), (1, None), (0, 4)])
@@ -54,13 +56,18 @@ def test_each_side_has_the_median_colour_of_its_own_photos(
 def test_black_points_are_those_without_a_colour(tmp_path: Path) -> None:
     """White ones have one, and black ones that no photo sees take the usual colour."""
     views = [
-        view(tmp_path, row, (200, 40, 10), [x, -4.0, 0.1]) for row, x in enumerate((-0.3, 0.0, 0.3, 0.1))
+        view(tmp_path, row, (200, 40, 10), [x, -4.0, 0.1])
+        for row, x in enumerate((-0.3, 0.0, 0.3, 0.1))
     ]
     rng = np.random.default_rng(0)
-    positions = np.concatenate([rng.uniform(-1, 1, (900, 3)) * (1, 0, 1), [[0, 50.0, 0], [0.05, 0, 0.05]]])
+    positions = np.concatenate(
+        [rng.uniform(-1, 1, (900, 3)) * (1, 0, 1), [[0, 50.0, 0], [0.05, 0, 0.05]]]
+    )
     colors = np.zeros((902, 3), np.float32)
     colors[-1] = 1
     cloud = _as_cloud(Points(positions, colors))
     found = colored(cloud, Cameras.of(views), "cloud", say=unsaid).colors
     np.testing.assert_array_equal(found[-1], 1)
-    np.testing.assert_allclose(found[:-1], np.tile(np.divide((200, 40, 10), 255), (901, 1)), atol=1e-3)
+    np.testing.assert_allclose(
+        found[:-1], np.tile(np.divide((200, 40, 10), 255), (901, 1)), atol=1e-3
+    )

@@ -34,7 +34,11 @@ def test_photos_alone_are_enough(points: bool, command_line: CommandLine, tmp_pa
     found = json.loads(out)
     assert (found["output_count"], found["against"]) == (500, "photos")
     assert found["scores"]["recovered"]["psnr"] > max(17, found["scores"]["simplified"]["psnr"] + 1)
-    said = "starting from 1,200 sparse points\n" if points else "starting from 500 points along camera rays\n"
+    said = (
+        "starting from 1,200 sparse points\n"
+        if points
+        else "starting from 500 points along camera rays\n"
+    )
     assert said in error
     assert "regularisers: none;" in error
     ours = g2ard.distill(None, views=tmp_path / "photos", count=500, steps=150).splats
@@ -43,7 +47,9 @@ def test_photos_alone_are_enough(points: bool, command_line: CommandLine, tmp_pa
     status, _, error = command_line(*ask, "-r", 4, "--steps", 5, "-w", cwd=tmp_path)
     assert status == (0 if points else 1)
     assert points or "give --count COUNT" in error
-    assert "give a SCENE, or photos" in refused(command_line, tmp_path, "distill", "-n", 500, "-o", "run")
+    assert "give a SCENE, or photos" in refused(
+        command_line, tmp_path, "distill", "-n", 500, "-o", "run"
+    )
 
 
 def test_sparse_points_given_as_a_cloud_are_known_and_other_clouds_are_surfaces(
@@ -52,7 +58,9 @@ def test_sparse_points_given_as_a_cloud_are_known_and_other_clouds_are_surfaces(
     photos_of(tmp_path / "photos", points=True)
     (tmp_path / "scan.ply").write_bytes((tmp_path / "photos" / "sparse.ply").read_bytes())
     ask = ("--views", "photos", "-n", 900, "--steps", 3)
-    sparse = succeeds(command_line, tmp_path, "distill", "photos/sparse.ply", *ask, "-o", "run", "-v").err
+    sparse = succeeds(
+        command_line, tmp_path, "distill", "photos/sparse.ply", *ask, "-o", "run", "-v"
+    ).err
     assert "regularisers: none;" in sparse
     assert "sparse.ply has" not in sparse, sparse
     scan = succeeds(command_line, tmp_path, "distill", "scan.ply", *ask, "-o", "scan", "-v").err
@@ -115,9 +123,22 @@ def test_a_hull_encloses_the_object_closely(tmp_path: Path) -> None:
     assert not hull.holds(cameras.positions).any()
 
 
-def test_more_gaussians_of_photos_take_more_steps(tmp_path: Path, command_line: CommandLine) -> None:
+def test_more_gaussians_of_photos_take_more_steps(
+    tmp_path: Path, command_line: CommandLine
+) -> None:
     photos_of(tmp_path / "photos")
-    ask = ("distill", "--views", "photos", "--dry-run", "-o", "run", "--json", "-", "--schedule", "fast")
+    ask = (
+        "distill",
+        "--views",
+        "photos",
+        "--dry-run",
+        "-o",
+        "run",
+        "--json",
+        "-",
+        "--schedule",
+        "fast",
+    )
 
     def steps(*budget: object) -> int:
         return int(json.loads(succeeds(command_line, tmp_path, *ask, *budget).out)["steps"])
@@ -154,7 +175,8 @@ def test_points_that_no_second_photo_supports_are_dropped(tmp_path: Path) -> Non
     noise = np.random.default_rng(0)
     for path in cameras.image_paths[::4]:
         assert path is not None
-        write_png(path, noise.uniform(0.2, 1, (48, 64, 3)), overwrite=True)  # a quarter shows nothing of it
+        # a quarter shows nothing of it
+        write_png(path, noise.uniform(0.2, 1, (48, 64, 3)), overwrite=True)
     found = points_along_rays(cameras, 600)
     away = np.abs(np.linalg.norm(found.positions, axis=1) - 1)
     assert np.mean(away < 0.25) > 0.8
@@ -163,7 +185,8 @@ def test_points_that_no_second_photo_supports_are_dropped(tmp_path: Path) -> Non
 def test_rays_may_give_no_point(tmp_path: Path) -> None:
     photos_of(tmp_path / "photos")
     cameras = g2ard.load_views(tmp_path / "photos").take([0, 8, 16])
-    for i, path in enumerate(filter(None, cameras.image_paths)):  # no two alike, until the limits are relaxed
+    # no two alike, until the limits are relaxed
+    for i, path in enumerate(filter(None, cameras.image_paths)):
         write_png(path, np.full((48, 64, 3), 0.2 + 0.3 * i), overwrite=True)
     assert len(points_along_rays(cameras, 70)) == 70
     write_png(tmp_path / "mask.png", np.zeros((48, 64)))
@@ -172,7 +195,19 @@ def test_rays_may_give_no_point(tmp_path: Path) -> None:
 
 
 def _of_photos(folder: Path, *ask: object, command_line: CommandLine) -> tuple[int, str]:
-    words = ("distill", "--views", "photos", "--steps", 2, "--no-page", "-o", "run", "-w", "--json", "-")
+    words = (
+        "distill",
+        "--views",
+        "photos",
+        "--steps",
+        2,
+        "--no-page",
+        "-o",
+        "run",
+        "-w",
+        "--json",
+        "-",
+    )
     out, error = succeeds(command_line, folder, *words, *ask)
     return json.loads(out)["output_count"], error
 
@@ -190,10 +225,14 @@ def test_photos_alone_need_no_count(command_line: CommandLine, tmp_path: Path) -
         assert f"{count:,} Gaussians, one per " in error
         assert f" pixels of {len(train)} photos; a count changes it\n" in error
         assert (
-            g2ard.distill(None, views=tmp_path / "photos", steps=2, size=size).report.rounds[-1].count
+            g2ard.distill(None, views=tmp_path / "photos", steps=2, size=size)
+            .report.rounds[-1]
+            .count
             == count
         )
-    assert "has no budget" not in refused(command_line, tmp_path, "distill", "photos", "-o", "other")
+    assert "has no budget" not in refused(
+        command_line, tmp_path, "distill", "photos", "-o", "other"
+    )
 
 
 def test_transparent_pixels_need_no_gaussians(command_line: CommandLine, tmp_path: Path) -> None:

@@ -41,7 +41,9 @@ KINDS = {
 
 @pytest.mark.parametrize("background", [(0.0, 0.0, 0.0), (1.0, 1.0, 1.0), (0.6, 0.8, 1.0)])
 @pytest.mark.parametrize("kind", KINDS)
-def test_only_photos_of_the_scene_are_accepted(kind: str, background: Colour, tmp_path: Path) -> None:
+def test_only_photos_of_the_scene_are_accepted(
+    kind: str, background: Colour, tmp_path: Path
+) -> None:
     scene = KINDS[kind](BALL)
     darker = photographed(tmp_path, BALL, VIEWS, gain=0.6, bias=0.1)
     said: list[str] = []
@@ -52,7 +54,11 @@ def test_only_photos_of_the_scene_are_accepted(kind: str, background: Colour, tm
     (tmp_path / "other").mkdir()
     other = photographed(tmp_path / "other", STRIPED, VIEWS)
     far = replace(around(12, (48, 36), distance=40.0), image_paths=paths)
-    for wrong, what in ((shifted, "correlation"), (other, "correlation"), (far, "covers less than 5%")):
+    for wrong, what in (
+        (shifted, "correlation"),
+        (other, "correlation"),
+        (far, "covers less than 5%"),
+    ):
         with pytest.raises(InputError, match="the photos do not show the scene") as refused:
             check_photos(scene, wrong, background, said.append)
         assert what in str(refused.value)

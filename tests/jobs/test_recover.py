@@ -41,7 +41,9 @@ def test_python_recovers_as_the_command_does(
     assert (folder / "python.ply").read_bytes() == (folder / "out.ply").read_bytes()
 
 
-def test_a_student_that_is_its_teacher_takes_no_step(folder: Path, command_line: CommandLine) -> None:
+def test_a_student_that_is_its_teacher_takes_no_step(
+    folder: Path, command_line: CommandLine
+) -> None:
     ask = ("recover", "ball.ply", "--teacher", "ball.ply", "--views", "views.json", "-o", "out.ply")
     told = succeeds(command_line, folder, *ask).err
     assert "recovery skipped: the scene already renders as its targets\n" in told
@@ -77,11 +79,16 @@ def test_a_generated_pool_is_completed_for_the_student(folder: Path) -> None:
     [
         ({"targets": g2ard.TeacherRenders(BALL, VIEWS), "views": VIEWS}, "views: goes with"),
         ({"targets": g2ard.TeacherRenders(BALL, VIEWS), "settings": {}}, "settings: goes with"),
-        ({"views": VIEWS, "teacher": BALL, "config": g2ard.RecoverConfig()}, "config: goes with targets"),
+        (
+            {"views": VIEWS, "teacher": BALL, "config": g2ard.RecoverConfig()},
+            "config: goes with targets",
+        ),
         ({}, "there are no targets; give views, or a teacher"),
         ({"views": VIEWS, "teacher": BALL, "anchors": BALL.take(range(9))}, "the student has 400"),
     ],
 )
-def test_arguments_of_one_source_of_targets_do_not_go_with_another(given: dict[str, Any], words: str) -> None:
+def test_arguments_of_one_source_of_targets_do_not_go_with_another(
+    given: dict[str, Any], words: str
+) -> None:
     with pytest.raises(InputError, match=words):
         g2ard.recover(BALL, **given)

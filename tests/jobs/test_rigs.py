@@ -34,7 +34,11 @@ def room() -> g2ard.Splats:
 def places(count: int, seed: int) -> list[np.ndarray]:
     rng = np.random.default_rng(seed)
     ways = rng.normal(size=(count, 3))
-    spots = 0.5 * ways * (rng.random((count, 1)) ** (1 / 3) / np.linalg.norm(ways, axis=1, keepdims=True))
+    spots = (
+        0.5
+        * ways
+        * (rng.random((count, 1)) ** (1 / 3) / np.linalg.norm(ways, axis=1, keepdims=True))
+    )
     return [look_at(spot, spot + rng.normal(size=3)) for spot in spots]
 
 
@@ -61,7 +65,9 @@ def fisheye(wide: np.ndarray, face: str) -> np.ndarray:
         np.minimum(pixels[:, 1].astype(int), 2 * WIDTH - 1),
         pixels[:, 0].astype(int) % (4 * WIDTH),
     )
-    shown = np.where((angle < REACH)[..., None], wide[rows, columns].reshape(3 * side, 3 * side, 3), 0)
+    shown = np.where(
+        (angle < REACH)[..., None], wide[rows, columns].reshape(3 * side, 3 * side, 3), 0
+    )
     return resize(shown.astype(np.float32), (side, side))
 
 
@@ -74,7 +80,8 @@ def written(folder: Path, kind: str, scene: g2ard.Splats) -> Path:
     renderer, poses = g2ard.Renderer(scene), places(8, 1)
     if kind == "panorama":
         shown = [
-            (pose, renderer.panorama(Camera(pose, np.eye(3), 8, 8), width=WIDTH).image) for pose in poses
+            (pose, renderer.panorama(Camera(pose, np.eye(3), 8, 8), width=WIDTH).image)
+            for pose in poses
         ]
         lens: dict[str, object] = {"camera_model": "EQUIRECTANGULAR", "w": WIDTH, "h": WIDTH // 2}
     elif kind == "fisheye":
@@ -92,7 +99,10 @@ def written(folder: Path, kind: str, scene: g2ard.Splats) -> Path:
     for i, (_, image) in enumerate(shown):
         write_png(folder / f"{i:03d}.png", np.clip(image, 0, 1))
     path = transforms(folder / "transforms.json", [pose for pose, _ in shown], **lens)
-    edit(path, lambda c: [frame.update(file_path=f"{i:03d}.png") for i, frame in enumerate(c["frames"])])
+    edit(
+        path,
+        lambda c: [frame.update(file_path=f"{i:03d}.png") for i, frame in enumerate(c["frames"])],
+    )
     return path
 
 
@@ -111,7 +121,10 @@ def test_scores_are_those_of_pinhole_photos(
         ask = ("distill", "cloud.ply", "--views", path, "-n", 700, "--no-page", "-o", f"{kind}.run")
         succeeds(command_line, tmp_path, *ask)
         found = g2ard.Renderer(g2ard.load(tmp_path / f"{kind}.run" / "scene.ply"))
-        off = [np.mean((found.clipped(view) - image) ** 2) for view, image in zip(held, truth, strict=True)]
+        off = [
+            np.mean((found.clipped(view) - image) ** 2)
+            for view, image in zip(held, truth, strict=True)
+        ]
         scores[kind] = float(np.mean(-10 * np.log10(off)))
         report = json.loads((tmp_path / f"{kind}.run" / "report.json").read_text())
         assert report["scores"]["recovered"]["psnr"] > 25, kind

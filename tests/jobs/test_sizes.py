@@ -55,14 +55,20 @@ def test_every_command_with_a_size_is_tried() -> None:
 
     register_commands()
     commands: dict[str, Any] = get_command(app).commands  # type: ignore[attr-defined]
-    sized = {name for name, found in commands.items() if any("--size" in p.opts for p in found.params)}
+    sized = {
+        name for name, found in commands.items() if any("--size" in p.opts for p in found.params)
+    }
     assert sized - set(OTHER) == set(COMMANDS)
 
 
-CASES = [(command, views) for command in COMMANDS for views in ("made", "views.json", "photos.json")]
+CASES = [
+    (command, views) for command in COMMANDS for views in ("made", "views.json", "photos.json")
+]
 
 
-@pytest.mark.parametrize(("command", "views"), [case for case in CASES if case != ("adapt", "made")])
+@pytest.mark.parametrize(
+    ("command", "views"), [case for case in CASES if case != ("adapt", "made")]
+)
 def test_a_larger_size_holds_except_for_photos(
     command: str, views: str, inputs: Path, tmp_path: Path, command_line: CommandLine
 ) -> None:
@@ -76,7 +82,8 @@ def test_a_larger_size_holds_except_for_photos(
                 assert image.width == (48 if views == "photos.json" else LARGE)
         return
     text = error + json.dumps(json.loads((folder / "told.json").read_text()), ensure_ascii=False)
-    photo = views == "photos.json" and command != "lod"  # whose levels are compared with renders of the scene
+    # whose levels are compared with renders of the scene
+    photo = views == "photos.json" and command != "lod"
     side, height = (48, 36) if photo else (LARGE, LARGE * 3 // 4)
     assert f"{side}×{height} px" in text or re.search(rf'"size": {side}\b', text), text
     assert f"{GENERATED}×" not in text
@@ -107,7 +114,19 @@ def test_runs_compared_are_scored_at_their_size(
 ) -> None:
     folder = shutil.copytree(inputs, tmp_path / "there")
     for name, seed in (("a", 0), ("b", 1)):
-        ask = ("distill", "ball.ply", "-r", 8, "--steps", 1, "--no-page", "--size", 40, "--seed", seed)
+        ask = (
+            "distill",
+            "ball.ply",
+            "-r",
+            8,
+            "--steps",
+            1,
+            "--no-page",
+            "--size",
+            40,
+            "--seed",
+            seed,
+        )
         succeeds(command_line, folder, *ask, "-o", name)
     out, error = succeeds(command_line, folder, "evaluate", "a", "b")
     assert " 40×30 px" in out + error

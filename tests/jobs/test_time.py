@@ -26,13 +26,17 @@ def job() -> jobs.DistillJob:
     return prepare(checkered_ball(1200), Budget(ratio=8), DistillOptions(size=48, time=60.0))
 
 
-def test_recovery_gets_what_the_rest_leaves(job: jobs.DistillJob, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_recovery_gets_what_the_rest_leaves(
+    job: jobs.DistillJob, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(jobs.DistillJob, "_scoring_seconds", lambda self: 4.0)
     monkeypatch.setattr(jobs.time, "monotonic", lambda: 12.0)
     assert replace(job, began=2.0).time_left(60.0) == 60 - 10 - 4
 
 
-def test_scoring_is_timed_in_some_views(job: jobs.DistillJob, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_scoring_is_timed_in_some_views(
+    job: jobs.DistillJob, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A second per view, of which the larger ones count by their pixels."""
     now = [0.0]
 
@@ -96,7 +100,9 @@ LIMITED = {
 
 
 @pytest.mark.parametrize("name", LIMITED)
-def test_a_dry_run_leaves_the_steps_open(name: str, folder: Path, command_line: CommandLine) -> None:
+def test_a_dry_run_leaves_the_steps_open(
+    name: str, folder: Path, command_line: CommandLine
+) -> None:
     save(folder / "small.ply", checkered_ball(50))
     told = succeeds(command_line, folder, *LIMITED[name].split(), "60s", "--dry-run", "--json", "-")
     assert json.loads(told.out)["steps"] is None

@@ -22,7 +22,9 @@ from helpers.photos import photographed
 from helpers.scenes import around, checkered_ball
 
 
-@pytest.mark.parametrize("rule", [Cut(), Cut(most=300), Cut(most=10_000, extent=3, least=50), Cut(most=1)])
+@pytest.mark.parametrize(
+    "rule", [Cut(), Cut(most=300), Cut(most=10_000, extent=3, least=50), Cut(most=1)]
+)
 def test_every_row_of_every_level_lies_in_one_leaf_and_its_box(rule: Cut) -> None:
     levels = [scattered(900), scattered(200, 1), scattered(40, 2)]
     leaves = leaves_of(cut(levels, rule))
@@ -30,13 +32,17 @@ def test_every_row_of_every_level_lies_in_one_leaf_and_its_box(rule: Cut) -> Non
         rows = np.concatenate([leaf.rows[number] for leaf in leaves])
         assert sorted(rows) == list(range(len(level)))
     for leaf in leaves:
-        means = np.concatenate([level.means[rows] for level, rows in zip(levels, leaf.rows, strict=True)])
+        means = np.concatenate(
+            [level.means[rows] for level, rows in zip(levels, leaf.rows, strict=True)]
+        )
         assert len(means) <= rule.most
         assert len(means) <= rule.least or np.ptp(means, axis=0).max() <= rule.extent
         for level, rows in zip(levels, leaf.rows, strict=True):
             for row in rows[:20]:
                 axes = rotation_matrices(level.quats[row : row + 1])[0] * level.scales[row]
-                corners = np.array([axes @ (np.array(corner) * 2 - 1) for corner in np.ndindex(2, 2, 2)])
+                corners = np.array(
+                    [axes @ (np.array(corner) * 2 - 1) for corner in np.ndindex(2, 2, 2)]
+                )
                 assert (level.means[row] + corners >= leaf.low - 1e-6).all()
                 assert (level.means[row] + corners <= leaf.high + 1e-6).all()
 
@@ -56,7 +62,12 @@ def test_streamed_sog_holds_the_leaves_where_the_tree_says(tmp_path: Path, offse
     size = save_levels(tmp_path / "out", levels, cut=Cut(most=250))
     meta = json.loads((tmp_path / "out" / "lod-meta.json").read_text())
     assert size == sum(p.stat().st_size for p in (tmp_path / "out").rglob("*") if p.is_file())
-    assert (meta["version"], meta["count"], meta["counts"], meta["lodLevels"]) == (1, 1100, [900, 200], 2)
+    assert (meta["version"], meta["count"], meta["counts"], meta["lodLevels"]) == (
+        1,
+        1100,
+        [900, 200],
+        2,
+    )
     files = [sog.Stream(tmp_path / "out" / name).whole() for name in meta["filenames"]]
     assert [len(file) for file in files].count(0) == 0
     nodes, seen = [meta["tree"]], np.zeros((2, 2), int)
@@ -75,7 +86,9 @@ def test_streamed_sog_holds_the_leaves_where_the_tree_says(tmp_path: Path, offse
     back = io.read_splats(tmp_path / "out" / "lod-meta.json")
     assert len(back) == 900
     np.testing.assert_array_equal(back.offset, np.full(3, offset))
-    np.testing.assert_allclose(np.sort(back.means, axis=0), np.sort(levels[0].means, axis=0), atol=2e-3)
+    np.testing.assert_allclose(
+        np.sort(back.means, axis=0), np.sort(levels[0].means, axis=0), atol=2e-3
+    )
 
 
 def test_files_of_an_earlier_call_go_and_others_stay(tmp_path: Path) -> None:
@@ -112,7 +125,9 @@ def test_an_interrupted_lod_resumes_to_the_same_bits(tmp_path: Path) -> None:
         lod(ball, **options, work=tmp_path / "work", say=stop)
     assert list((tmp_path / "work").rglob("*.npz"))
     again = lod(ball, **options, work=tmp_path / "work")
-    assert [level.fingerprint() for level in again.splats] == [level.fingerprint() for level in whole.splats]
+    assert [level.fingerprint() for level in again.splats] == [
+        level.fingerprint() for level in whole.splats
+    ]
 
 
 @pytest.mark.parametrize("ratios", [(), (2, 1), (1, 1), (0.5, 2), (1, float("nan"))])
@@ -121,13 +136,18 @@ def test_ratios_are_rising_numbers(ratios: tuple[float, ...]) -> None:
         lod(checkered_ball(50), ratios=ratios)
 
 
-def test_a_dry_run_tells_the_cost_of_every_level_and_writes_nothing(tmp_path: Path, command_line) -> None:
+def test_a_dry_run_tells_the_cost_of_every_level_and_writes_nothing(
+    tmp_path: Path, command_line
+) -> None:
     g2ard.save(tmp_path / "ball.ply", checkered_ball(400))
     g2ard.save_views(tmp_path / "v.json", around(8, (32, 24)))
     ask = ("lod", "ball.ply", "-r", "1,4,8", "--views", "v.json", "-o", "lod", "--dry-run")
     told = succeeds(command_line, tmp_path, *ask, "--steps", "90", "--json", "-")
     levels = json.loads(told.out)["levels"]
-    assert [(one["level"], one["count"], one["steps"]) for one in levels] == [(1, 100, 90), (2, 50, 90)]
+    assert [(one["level"], one["count"], one["steps"]) for one in levels] == [
+        (1, 100, 90),
+        (2, 50, 90),
+    ]
     lines = [line for line in told.err.splitlines() if "roughly" in line]
     assert [line.partition(":")[0] for line in lines] == ["level 1", "level 2", "all levels"]
     merged = succeeds(command_line, tmp_path, *ask, "--merge-only", "-q").err
@@ -167,7 +187,20 @@ def test_a_stopped_run_with_other_options(
 ) -> None:
     io.write_splats(tmp_path / "ball.ply", checkered_ball(800))
     g2ard.save_views(tmp_path / "v.json", around(8, (48, 36)))
-    given = ("lod", "ball.ply", "-o", "out", "-r", "1,4", "--views", "v.json", "--steps", "3", "--size", "48")
+    given = (
+        "lod",
+        "ball.ply",
+        "-o",
+        "out",
+        "-r",
+        "1,4",
+        "--views",
+        "v.json",
+        "--steps",
+        "3",
+        "--size",
+        "48",
+    )
 
     def stop(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
@@ -186,10 +219,24 @@ def test_a_stopped_run_with_other_options(
 def test_the_sky_is_the_environment(tmp_path: Path, command_line) -> None:
     ball = checkered_ball(800)
     rays = np.random.default_rng(1).normal(size=(100, 3))
-    sky = Splats.create(60 * rays / np.linalg.norm(rays, axis=1)[:, None], scales=np.full((100, 3), 8.0))
+    sky = Splats.create(
+        60 * rays / np.linalg.norm(rays, axis=1)[:, None], scales=np.full((100, 3), 8.0)
+    )
     io.write_splats(tmp_path / "a.ply", join([ball, sky]))
     g2ard.save_views(tmp_path / "v.json", around(8, (48, 36)))
-    words = ("lod", "a.ply", "-o", "out", "-r", "1,8", "--merge-only", "--views", "v.json", "--size", 48)
+    words = (
+        "lod",
+        "a.ply",
+        "-o",
+        "out",
+        "-r",
+        "1,8",
+        "--merge-only",
+        "--views",
+        "v.json",
+        "--size",
+        48,
+    )
     io.write_splats(tmp_path / "ball.ply", ball)
     error = succeeds(command_line, tmp_path, "lod", "ball.ply", "--dry-run", "--environment").err
     assert "sky: none" in error
@@ -209,7 +256,9 @@ def test_levels_learn_from_photos_where_views_have_them(tmp_path: Path) -> None:
     """Half of the views have photos, and these are dark."""
     ball = checkered_ball(400)
     views = photographed(tmp_path, ball, around(16, (48, 36)), gain=0.3)
-    views = replace(views, image_paths=tuple(p if i % 2 else None for i, p in enumerate(views.image_paths)))
+    views = replace(
+        views, image_paths=tuple(p if i % 2 else None for i, p in enumerate(views.image_paths))
+    )
     levels = {
         photos: lod(ball, ratios=(8,), views=views, photos=photos, steps=20).splats[0]
         for photos in (None, False)

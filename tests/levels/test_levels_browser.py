@@ -50,7 +50,11 @@ def streaming(
     """A folder of levels with the page that `lod` writes, opening at a camera."""
     save_levels(folder / name, levels, cut=Cut(4096, 1.0, 512), environment=sky, overwrite=True)
     write_level_page(
-        folder / name, levels, "sog", given=GivenViews(Cameras.of([camera]), None, (0, 0, 1)), background=GREY
+        folder / name,
+        levels,
+        "sog",
+        given=GivenViews(Cameras.of([camera]), None, (0, 0, 1)),
+        background=GREY,
     )
 
 
@@ -67,19 +71,26 @@ def test_each_level(
     show(browser, f"{address}/{name}/")
     camera = opened(folder / name / "index.html", FRONT)
     assert_shows(browser, rendered(levels[finest], camera), 35)
-    fetched = {url.removeprefix(f"{address}/{name}/") for url in browser.requests if f"/{name}/" in url}
+    fetched = {
+        url.removeprefix(f"{address}/{name}/") for url in browser.requests if f"/{name}/" in url
+    }
     assert "lod-meta.json" in fetched
     assert any(re.match(r"0_\d+/", file) for file in fetched)
 
 
-def test_the_environment(browser: Browser, site: tuple[Path, str], levels: tuple[Splats, ...]) -> None:
+def test_the_environment(
+    browser: Browser, site: tuple[Path, str], levels: tuple[Splats, ...]
+) -> None:
     """Show a sky outside of the tree's box, by which the viewer sets the far plane."""
     folder, address = site
     rng = np.random.default_rng(0)
     rays = rng.normal(size=(400, 3))
     rays *= 12 / np.linalg.norm(rays, axis=1, keepdims=True)
     sky = Splats.create(
-        rays, scales=np.full((400, 3), 0.5), logit_opacities=np.ones(400), sh0=rng.normal(size=(400, 1, 3))
+        rays,
+        scales=np.full((400, 3), 0.5),
+        logit_opacities=np.ones(400),
+        sh0=rng.normal(size=(400, 1, 3)),
     )
     streaming(folder, "sky", levels, FRONT, sky)
     show(browser, f"{address}/sky/")
@@ -120,7 +131,8 @@ def test_cesium_shows_each_level_on_the_globe(
         (folder / "globe.html").write_text(GLOBE)
         save_tileset(folder / "globe", levels, up=(0, 0, 1), place=place, cut=Cut(4096, 1.0, 512))
     turn, origin = place.matrix()[:3, :3], place.matrix()[:3, 3]
-    eye = np.array([18, -16, 9.0])  # far, so that a level's tiles have about the same error on the screen
+    # far, so that a level's tiles have about the same error on the screen
+    eye = np.array([18, -16, 9.0])
     large = Camera.facing(eye, [0, 0, 0], width=4 * WIDTH, height=4 * HEIGHT, fov=6)
     picture = np.clip(Renderer(levels[level]).image(large), 0, 1).reshape(HEIGHT, 4, WIDTH, 4, 3)
     expected = picture[:, 1:3, :, 1:3].mean(axis=(1, 3))
@@ -185,11 +197,14 @@ def test_a_globe_page_opens_at_the_view(
     name = f"page-{place is None}"
     save_tileset(folder / name, levels[-1:], up=(0, 0, 1), place=place)
     (folder / name / "cesium").symlink_to(peer)
-    write_level_page(folder / name, levels[-1:], "3dtiles", GivenViews(Cameras.of([FRONT]), None, (0, 0, 1)))
+    write_level_page(
+        folder / name, levels[-1:], "3dtiles", GivenViews(Cameras.of([FRONT]), None, (0, 0, 1))
+    )
     assert told(browser, f"{address}/{name}/?cesium=cesium") == ""
     camera = opened(folder / name / "index.html", FRONT)
     expected, until, found = rendered(levels[-1], camera), time.monotonic() + 60, 0.0
-    inside = np.abs(expected - GREY).max(-1) > 0.1  # nothing behind the ball but the globe and the sky
+    # nothing behind the ball but the globe and the sky
+    inside = np.abs(expected - GREY).max(-1) > 0.1
     while found < 25 and time.monotonic() < until:
         browser.run("new Promise(done => setTimeout(done, 500))")
         found = psnr(browser.picture()[inside][None] / np.float32(255), expected[inside][None])

@@ -82,7 +82,9 @@ def geocentric(lon: float, lat: float, height: float) -> np.ndarray:
     lon, lat = np.radians((lon, lat))
     n = a * a / np.hypot(a * np.cos(lat), b * np.sin(lat))
     r = (n + height) * np.cos(lat)
-    return np.array([r * np.cos(lon), r * np.sin(lon), (b * b / (a * a) * n + height) * np.sin(lat)])
+    return np.array(
+        [r * np.cos(lon), r * np.sin(lon), (b * b / (a * a) * n + height) * np.sin(lat)]
+    )
 
 
 @pytest.mark.parametrize("heading", [0.0, 90.0, 200.0])
@@ -144,21 +146,41 @@ def test_a_map_system_in_feet_gives_metres(tmp_path: Path) -> None:
     save_tileset(tmp_path, [scene], up=(0, 0, 1), place="EPSG:2994", say=told.append)
     assert not any("warning" in line for line in told)
     matrix = (
-        np.array(json.loads((tmp_path / "tileset.json").read_text())["root"]["transform"]).reshape(4, 4).T
+        np.array(json.loads((tmp_path / "tileset.json").read_text())["root"]["transform"])
+        .reshape(4, 4)
+        .T
     )
-    lon, lat = pyproj.Transformer.from_crs("EPSG:2994", "EPSG:4326", always_xy=True).transform(*offset[:2])
+    lon, lat = pyproj.Transformer.from_crs("EPSG:2994", "EPSG:4326", always_xy=True).transform(
+        *offset[:2]
+    )
     np.testing.assert_allclose(matrix[:3, 3], geocentric(lon, lat, 400 * 0.3048), atol=1e-3)
     np.testing.assert_allclose(np.linalg.norm(matrix[:3, 0]), 0.3048)
-    save_tileset(tmp_path, [scene], up=(0, 0, 1), place="EPSG:3301", overwrite=True, say=told.append)
+    save_tileset(
+        tmp_path, [scene], up=(0, 0, 1), place="EPSG:3301", overwrite=True, say=told.append
+    )
     assert "warning: the scene lies outside the area of EPSG:3301" in "\n".join(told)
 
 
-@pytest.mark.parametrize(("unit", "metres"), [("", 1), ("--unit ft", 0.3048), ("--unit us-ft", 1200 / 3937)])
+@pytest.mark.parametrize(
+    ("unit", "metres"), [("", 1), ("--unit ft", 0.3048), ("--unit us-ft", 1200 / 3937)]
+)
 def test_the_unit_scales_the_tiles(
     unit: str, metres: float, tmp_path: Path, command_line: CommandLine
 ) -> None:
     write_splats(tmp_path / "a.ply", checkered_ball(400))
-    words = ["lod", "a.ply", "-r", "1", "--merge-only", "--size", "48", "--format", "3dtiles", "-o", "out"]
+    words = [
+        "lod",
+        "a.ply",
+        "-r",
+        "1",
+        "--merge-only",
+        "--size",
+        "48",
+        "--format",
+        "3dtiles",
+        "-o",
+        "out",
+    ]
     error = succeeds(command_line, tmp_path, *words, "--georeference", "0,0,0", *unit.split()).err
     assert ("if its unit is the metre; --unit ft otherwise" in error) == (not unit)
     assert "m across" in error
@@ -172,12 +194,26 @@ def test_the_unit_scales_the_tiles(
 def test_the_unit_of_a_scan_is_used(tmp_path: Path, command_line: CommandLine) -> None:
     header = laspy.LasHeader(point_format=7, version="1.4")
     header.scales = np.full(3, 1e-3)
-    header.vlrs.append(laspy.vlrs.known.WktCoordinateSystemVlr('PROJCS["Oregon",UNIT["foot",0.3048]]'))
+    header.vlrs.append(
+        laspy.vlrs.known.WktCoordinateSystemVlr('PROJCS["Oregon",UNIT["foot",0.3048]]')
+    )
     scan = laspy.LasData(header)
     scan.x, scan.y, scan.z = checkered_ball(400).means.T
     scan.red = scan.green = scan.blue = np.arange(400) * 99
     scan.write(str(tmp_path / "a.las"))
-    ask = ("lod", "a.las", "-r", "1", "--merge-only", "--tile-rows", 200, "--format", "3dtiles", "-o", "out")
+    ask = (
+        "lod",
+        "a.las",
+        "-r",
+        "1",
+        "--merge-only",
+        "--tile-rows",
+        200,
+        "--format",
+        "3dtiles",
+        "-o",
+        "out",
+    )
     error = succeeds(command_line, tmp_path, *ask, "--georeference", "0,0,0").err
     assert "if its unit" not in error
     matrix = json.loads((tmp_path / "out" / "tileset.json").read_text())["root"]["transform"]
@@ -186,7 +222,18 @@ def test_the_unit_of_a_scan_is_used(tmp_path: Path, command_line: CommandLine) -
 
 def test_the_command_writes_3d_tiles(tmp_path: Path, command_line: CommandLine) -> None:
     write_splats(tmp_path / "a.ply", replace(checkered_ball(800), offset=np.array(UTM)))
-    words = ["lod", "a.ply", "-r", "1,4", "--merge-only", "--size", "48", "--format", "3dtiles", "-o"]
+    words = [
+        "lod",
+        "a.ply",
+        "-r",
+        "1,4",
+        "--merge-only",
+        "--size",
+        "48",
+        "--format",
+        "3dtiles",
+        "-o",
+    ]
     there = ["--georeference", "24.75,59.43,31.5,45"]
     error = succeeds(command_line, tmp_path, *words, "out", *there).err
     assert "up is 0,0,1" in error
@@ -204,12 +251,26 @@ def test_the_command_writes_3d_tiles(tmp_path: Path, command_line: CommandLine) 
     assert "latitude" in refused(command_line, tmp_path, *words, "c", "--georeference", "0,99,0")
 
 
-def test_python_decides_up_and_place_as_the_command_does(tmp_path: Path, command_line: CommandLine) -> None:
+def test_python_decides_up_and_place_as_the_command_does(
+    tmp_path: Path, command_line: CommandLine
+) -> None:
     pytest.importorskip("pyproj")
     write_splats(tmp_path / "ball.ply", checkered_ball(400))
-    ask = ("-r", "1,4", "--merge-only", "--size", 48, "--format", "3dtiles", "--georeference", "EPSG:32635")
+    ask = (
+        "-r",
+        "1,4",
+        "--merge-only",
+        "--size",
+        48,
+        "--format",
+        "3dtiles",
+        "--georeference",
+        "EPSG:32635",
+    )
     succeeds(command_line, tmp_path, "lod", "ball.ply", *ask, "-o", "globe")
     levels = lod(tmp_path / "ball.ply", ratios=(1, 4), recover=False, size=48).splats
-    save_tileset(tmp_path / "python", levels, place="EPSG:32635", cut=Cut(512 * 1024, 16.0, 8 * 1024))
+    save_tileset(
+        tmp_path / "python", levels, place="EPSG:32635", cut=Cut(512 * 1024, 16.0, 8 * 1024)
+    )
     for file in (tmp_path / "python").iterdir():
         assert (tmp_path / "globe" / file.name).read_bytes() == file.read_bytes(), file.name

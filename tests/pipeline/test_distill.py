@@ -26,7 +26,9 @@ from helpers.scenes import around, assert_same_bits, checkered_ball
 
 PRIOR = checkered_ball()
 ROUNDS = replace(TUNED, steps=20, round_steps=10)
-PAPER_ROUNDS = DistillConfig(SelectConfig(), SimplifyConfig(method="paper"), RecoverConfig(schedule=ROUNDS))
+PAPER_ROUNDS = DistillConfig(
+    SelectConfig(), SimplifyConfig(method="paper"), RecoverConfig(schedule=ROUNDS)
+)
 
 
 @pytest.fixture(scope="module")
@@ -39,7 +41,12 @@ def test_views_of_another_kind_are_handed_on(targets: TeacherRenders, tmp_path: 
     config = DistillConfig(recover=RecoverConfig(steps=20))
     done = distill(PRIOR, 300, targets, config, validation=near, work=tmp_path)
     assert done.report.rounds[0].recover[0].validation.looks
-    assert not distill(PRIOR, 300, targets, config, work=tmp_path).report.rounds[0].recover[0].validation
+    assert (
+        not distill(PRIOR, 300, targets, config, work=tmp_path)
+        .report.rounds[0]
+        .recover[0]
+        .validation
+    )
 
 
 def test_one_step_per_round_makes_rounds(targets: TeacherRenders) -> None:
@@ -66,7 +73,20 @@ def test_only_steps_of_a_changed_setting_or_a_damaged_file_are_repeated(
 
 def test_command_on_a_trained_scene(command_line: CommandLine, tmp_path: Path) -> None:
     write_splats(tmp_path / "ball.ply", PRIOR)
-    ask = ("distill", "ball.ply", "-r", 10, "-o", "run", "--steps", 60, "--method", "paper", "--size", 100)
+    ask = (
+        "distill",
+        "ball.ply",
+        "-r",
+        10,
+        "-o",
+        "run",
+        "--steps",
+        60,
+        "--method",
+        "paper",
+        "--size",
+        100,
+    )
     ask = (*ask, "--json", "-")
     out, error = succeeds(command_line, tmp_path, *ask)
     report = json.loads(out)
@@ -94,7 +114,15 @@ def test_command_on_a_trained_scene(command_line: CommandLine, tmp_path: Path) -
         assert f"{kind['detail']['before']:.2f} → {kind['detail']['after']:.2f}" in error
     left = sorted(p.name for p in (tmp_path / "run").iterdir())
     assert left == [
-        *("preview.png", "report.html", "report.json", "scene.ply", "scored.json", "view.html", "views.json")
+        *(
+            "preview.png",
+            "report.html",
+            "report.json",
+            "scene.ply",
+            "scored.json",
+            "view.html",
+            "views.json",
+        )
     ]
     assert report["bytes"]["view"] == (tmp_path / "run" / "view.html").stat().st_size
     assert "view: run/view.html" in error
@@ -108,7 +136,9 @@ def test_a_loss_in_any_kind_of_view_is_reported() -> None:
     from g2ard.report.run import RunReport, describe_loss, list_remarks, summarize_by_kind
     from g2ard.stages.evaluate import ViewScore
 
-    def said(usual: float, near: float | None, unseen: float | None, ssim: float = 0.0) -> list[str]:
+    def said(
+        usual: float, near: float | None, unseen: float | None, ssim: float = 0.0
+    ) -> list[str]:
         before, after = [], []
         for kind, gain in (("usual", usual), ("near", near)):
             for i, share in enumerate((2.5, -0.5) if gain is not None else ()):
@@ -116,19 +146,26 @@ def test_a_loss_in_any_kind_of_view_is_reported() -> None:
                 before.append(view)
                 after.append(replace(view, psnr=30.0 + share * gain, ssim=0.9 + ssim))
         found = {"rounds": (), "kinds": summarize_by_kind(before, after), "unseen": unseen}
-        return list_remarks(RunReport(**{field.name: found.get(field.name) for field in fields(RunReport)}))
+        return list_remarks(
+            RunReport(**{field.name: found.get(field.name) for field in fields(RunReport)})
+        )
 
-    assert said(1.0, None, None) == ["1 of 2 usual views lost PSNR; the mean of all 2 gained 1.00 dB"]
+    assert said(1.0, None, None) == [
+        "1 of 2 usual views lost PSNR; the mean of all 2 gained 1.00 dB"
+    ]
     assert said(0.02, 0.02, 0.0) == []
     line = said(0.02, -0.5, 0.0)[0]
-    assert line.startswith("warning: recovery lost 0.50 dB in near views (worst view near_0: 30.00 → 28.75")
+    assert line.startswith(
+        "warning: recovery lost 0.50 dB in near views (worst view near_0: 30.00 → 28.75"
+    )
     mixed = said(0.3, 0.3, 0.0, ssim=-0.004)[0]
     assert mixed == "recovery lost 0.004 SSIM and gained 0.30 dB in usual views"
     assert said(0.0, None, 0.0, ssim=-0.004)[0].startswith("warning: recovery lost 0.004 SSIM")
     before = [ViewScore(15.0, name="a"), ViewScore(30.0, name="b")]
     after = [ViewScore(15.5, name="a"), ViewScore(29.0, name="b")]
     line = describe_loss(summarize_by_kind(before, after)[0], "")
-    assert "recovery lost 0.25 dB in usual views (1 of 2 views lost PSNR)" in line  # the worst view gained
+    # the worst view gained
+    assert "recovery lost 0.25 dB in usual views (1 of 2 views lost PSNR)" in line
     lines = said(-0.2, -0.3, 0.25)
     assert "lost 0.20 dB in usual views" in lines[0]
     assert "25% of the scene is in no view" in lines[2]
@@ -137,7 +174,8 @@ def test_a_loss_in_any_kind_of_view_is_reported() -> None:
 def test_steps_by_need_are_for_teachers() -> None:
     from g2ard.pipeline.distill import _configure_recovery
 
-    part = replace(around(12), Ks=around(12).Ks * [[[4], [4], [1]]])  # a sixteenth of the ball in each
+    # a sixteenth of the ball in each
+    part = replace(around(12), Ks=around(12).Ks * [[[4], [4], [1]]])
 
     def horizon(targets: Targets, config: DistillConfig) -> int | None:
         return _configure_recovery(
@@ -164,28 +202,51 @@ def test_command_on_a_cloud_with_photos(command_line: CommandLine, tmp_path: Pat
     assert report["against"] == "photos"
     assert report["apart"] is None  # photos are only where they were taken
     assert 0 <= report["unseen"] < 0.05
-    simplified, recovered = (report["scores"][stage]["psnr"] for stage in ("simplified", "recovered"))
+    simplified, recovered = (
+        report["scores"][stage]["psnr"] for stage in ("simplified", "recovered")
+    )
     assert simplified > 20.5
     assert recovered > max(21.5, simplified)
     result = read_splats(tmp_path / "run" / "scene.ply")
     assert (len(result), result.sh_degree) == (400, 3)
 
 
-def test_a_scanned_cloud_and_photos_are_distilled(command_line: CommandLine, tmp_path: Path) -> None:
+def test_a_scanned_cloud_and_photos_are_distilled(
+    command_line: CommandLine, tmp_path: Path
+) -> None:
     """Positions of a million metres, one offset, photos in the same coordinates."""
-    place, colors = np.array([443_000.0, 4_428_000.0, 1600.0]), np.uint16(65535 * PRIOR.colors.clip(0, 1))
+    place, colors = (
+        np.array([443_000.0, 4_428_000.0, 1600.0]),
+        np.uint16(65535 * PRIOR.colors.clip(0, 1)),
+    )
     points = PRIOR.means + place
     for name in ("a.las", "b.LAZ"):
         las(tmp_path / name, points, colors)
         np.testing.assert_allclose(g2ard.load_points(tmp_path / name).positions, points, atol=6e-4)
     views = around(16, (32, 24)).recentred(-place)
-    g2ard.save_views(tmp_path / "views.json", photographed(tmp_path, replace(PRIOR, offset=place), views))
-    ask = ("distill", name, "--views", "views.json", "-n", 400, "-o", "run", "--steps", 3, "--no-page")
+    g2ard.save_views(
+        tmp_path / "views.json", photographed(tmp_path, replace(PRIOR, offset=place), views)
+    )
+    ask = (
+        "distill",
+        name,
+        "--views",
+        "views.json",
+        "-n",
+        400,
+        "-o",
+        "run",
+        "--steps",
+        3,
+        "--no-page",
+    )
     assert " → 400 Gaussians; 14 training views" in succeeds(command_line, tmp_path, *ask).err
     np.testing.assert_allclose(g2ard.load(tmp_path / "run" / "scene.ply").offset, place, rtol=1e-4)
     las(tmp_path / "plain.las", PRIOR.means, None)
     error = refused(command_line, tmp_path, "lift", "plain.las", "-o", "p.ply", status=1)
-    assert "has no colours ('red', 'green', 'blue'), and intensities are equal; add colours" in error
+    assert (
+        "has no colours ('red', 'green', 'blue'), and intensities are equal; add colours" in error
+    )
 
 
 @pytest.mark.parametrize(("ratio", "measured"), [(1.0, False), (10.0, True)])

@@ -181,7 +181,9 @@ def test_no_class_with_a_key_is_forgotten() -> None:
     found = set()
     for module in pkgutil.walk_packages(g2ard.__path__, "g2ard."):
         if not module.name.endswith("__main__"):
-            for _, kind in inspect.getmembers(importlib.import_module(module.name), inspect.isclass):
+            for _, kind in inspect.getmembers(
+                importlib.import_module(module.name), inspect.isclass
+            ):
                 own = kind.__module__.startswith("g2ard.") and not inspect.isabstract(kind)
                 if own and any(computed(kind, name) for name in ("fingerprint", "key", "source")):
                     found.add(kind)
@@ -247,7 +249,10 @@ def test_every_input_of_a_step_changes_its_key() -> None:
     assert set(named) == {"self", *given, "filled", "options"}
     keys = [recorded(lambda own: own.recover(**given))]
     for name, value in given.items():
-        for other in (*others(value), *([None] if name in ("built", "weights", "validation") else [])):
+        for other in (
+            *others(value),
+            *([None] if name in ("built", "weights", "validation") else []),
+        ):
             changed = given | {name: other}
             keys.append(recorded(lambda own, changed=changed: own.recover(**changed)))
     assert len(set(keys)) == len(keys)
@@ -269,6 +274,8 @@ def test_every_input_of_a_simplification_changes_its_key() -> None:
         for other in others(value):
             changed = given | {name: other}
             keys.append(
-                recorded(lambda own, changed=changed: distill._simplify_round(own, **changed, **kept))
+                recorded(
+                    lambda own, changed=changed: distill._simplify_round(own, **changed, **kept)
+                )
             )
     assert len(set(keys)) == len(keys)

@@ -55,7 +55,9 @@ def test_preset_paper_sets_every_stage_of_distill(folder: Path, command_line: Co
     out, error = succeeds(command_line, folder, *DISTILL, "--preset", "paper", "-v", "--json", "-")
     report = json.loads(out)
     assert error.count("never acted") == 1  # the regularisers, in rounds this short
-    assert "never acted in round 1, round 2, round 3, round 4, the last recovery of round 4" in error
+    assert (
+        "never acted in round 1, round 2, round 3, round 4, the last recovery of round 4" in error
+    )
     assert "there were 20 to 75" in error
     whole = preset("paper")
     used = changed(whole, {"recover.schedule": FEW, "recover.steps": 75})
@@ -72,8 +74,19 @@ def test_preset_paper_sets_every_stage_of_distill(folder: Path, command_line: Co
 
 
 def test_explicit_options_override_the_preset(folder: Path, command_line: CommandLine) -> None:
-    (folder / "c.toml").write_text('[distill]\nmethod = "default"\n[distill.set]\npolicy = "auto"\n')
-    said = ("--config", "c.toml", "--method", "fast", "--set", "views_count=4", "--set", "anchor=0.3")
+    (folder / "c.toml").write_text(
+        '[distill]\nmethod = "default"\n[distill.set]\npolicy = "auto"\n'
+    )
+    said = (
+        "--config",
+        "c.toml",
+        "--method",
+        "fast",
+        "--set",
+        "views_count=4",
+        "--set",
+        "anchor=0.3",
+    )
     report = run(command_line, folder, *SHORT, "--preset", "paper", *said, "--set", "sh_degree=1")
     assert (report["views"]["policy"], len(report["views"]["chosen"])) == ("auto", 4)
     settings = report["settings"]
@@ -100,7 +113,18 @@ def test_a_point_cloud_gets_the_weights_of_lifts(folder: Path, command_line: Com
 
 def test_schedule_and_preset_differ_in_recover(folder: Path, command_line: CommandLine) -> None:
     write_views(folder / "w.json", around(24), weights=[1.0] * 24)
-    ask = ("recover", "ball.ply", "--views", "w.json", "--teacher", "ball.ply", "-o", "o.ply", "--steps", 4)
+    ask = (
+        "recover",
+        "ball.ply",
+        "--views",
+        "w.json",
+        "--teacher",
+        "ball.ply",
+        "-o",
+        "o.ply",
+        "--steps",
+        4,
+    )
     for option, weighted in (("--schedule", True), ("--preset", False)):
         report = run(command_line, folder, *ask, option, "paper")
         assert read_splats(folder / "o.ply").sh_degree == 3
@@ -114,19 +138,53 @@ def test_schedule_and_preset_differ_in_recover(folder: Path, command_line: Comma
 def test_the_other_commands_know_it(folder: Path, command_line: CommandLine) -> None:
     (folder / "c.toml").write_text('preset = "paper-lift"\n[recover]\nsteps = 2\n')
     for asked in (("--method", "paper"), ("--preset", "paper"), ("--config", "c.toml")):
-        run(command_line, folder, "simplify", "ball.ply", "-r", 3, "-o", f"{asked[0][2:]}.ply", *asked)
+        run(
+            command_line,
+            folder,
+            "simplify",
+            "ball.ply",
+            "-r",
+            3,
+            "-o",
+            f"{asked[0][2:]}.ply",
+            *asked,
+        )
     made = {(folder / f"{name}.ply").read_bytes() for name in ("method", "preset", "config")}
     assert len(made) == 1
     found = run(
-        command_line, folder, "select", "ball.ply", "--views", "v.json", "-o", "k.json", "--preset", "paper"
+        command_line,
+        folder,
+        "select",
+        "ball.ply",
+        "--views",
+        "v.json",
+        "-o",
+        "k.json",
+        "--preset",
+        "paper",
     )
     assert (found["policy"], len(found["views"])) == ("directional", 10)
-    ask = ("adapt", "ball.ply", "--views", "v.json", "--teacher", "ball.ply", "-o", "o.ply", "--steps", 6)
+    ask = (
+        "adapt",
+        "ball.ply",
+        "--views",
+        "v.json",
+        "--teacher",
+        "ball.ply",
+        "-o",
+        "o.ply",
+        "--steps",
+        6,
+    )
     done = run(command_line, folder, *ask, "--preset", "paper")
     rates = {**vars(PAPER.rates), **dict.fromkeys(("means", "log_scales", "quats"), 0.0)}
     for name in ("means", "log_scales", "quats", "logit_opacities", "sh0", "shN"):
         assert done["settings"][f"adapt.recovery.rates.{name}"] == rates[name]
-    assert (done["steps"], done["settings"]["adapt.schedule"], done["colour_change"]) == (6, "paper", None)
+    assert (done["steps"], done["settings"]["adapt.schedule"], done["colour_change"]) == (
+        6,
+        "paper",
+        None,
+    )
 
 
 def test_in_python() -> None:
@@ -141,7 +199,8 @@ def test_in_python() -> None:
 
 def test_anchors_hold_from_construction_to_the_end(targets: TeacherRenders) -> None:
     config = changed(
-        preset("paper"), {"recover.schedule": FEW, "recover.regularizers": FREE, "select.views_count": None}
+        preset("paper"),
+        {"recover.schedule": FEW, "recover.regularizers": FREE, "select.views_count": None},
     )
     result = distill(PRIOR, 1000, targets, config)
     first, last = result.report.rounds[-1].recover
@@ -187,10 +246,28 @@ def test_the_paper_s_rates_do_not_depend_on_the_unit() -> None:
 def test_a_kept_scene_reproduces_the_drift(folder: Path, command_line: CommandLine) -> None:
     report = run(command_line, folder, *SHORT, "--preset", "paper", "--keep")
     kept = folder / "run" / "simplified" / "scene.ply"
-    ask = ("evaluate", "run/scene.ply", "--views", "v.json", "--teacher", "ball.ply", "--anchors", kept)
+    ask = (
+        "evaluate",
+        "run/scene.ply",
+        "--views",
+        "v.json",
+        "--teacher",
+        "ball.ply",
+        "--anchors",
+        kept,
+    )
     found = run(command_line, folder, *ask)["scenes"][0]["drift95"]
     assert math.isclose(found, report["rounds"][-1]["recover"][-1]["drift95"], rel_tol=1e-4)
-    ask = ("recover", "run/scene.ply", "--views", "v.json", "--teacher", "ball.ply", "-o", "more.ply")
+    ask = (
+        "recover",
+        "run/scene.ply",
+        "--views",
+        "v.json",
+        "--teacher",
+        "ball.ply",
+        "-o",
+        "more.ply",
+    )
     short = ("--schedule", "paper", "--steps", 2)
     again = run(command_line, folder, *ask, *short, "--anchors", kept)["drift95"]
     assert abs(again - found) < abs(run(command_line, folder, *ask, *short)["drift95"] - found)

@@ -78,7 +78,11 @@ def recovery(**settings: Any) -> Call:
     def call(work: Path | None, progress: Any) -> Any:
         file = None if work is None else work / "c.npz"
         return recover(
-            SMALL, config=config, checkpoint=file, progress=progress, **made({"targets": renders, **given})
+            SMALL,
+            config=config,
+            checkpoint=file,
+            progress=progress,
+            **made({"targets": renders, **given}),
         )
 
     return call
@@ -111,7 +115,8 @@ CASES: dict[str, Call] = {
     "distill": distillation(DistillConfig(recover=RecoverConfig(steps=12)), validation=near),
     "distill-rounds": distillation(
         DistillConfig(
-            SelectConfig(views_count=4, reselect=True), recover=RecoverConfig(schedule=ROUNDS, sh_degree=0)
+            SelectConfig(views_count=4, reselect=True),
+            recover=RecoverConfig(schedule=ROUNDS, sh_degree=0),
         )
     ),
     "paper": distillation(PAPER),
@@ -132,7 +137,9 @@ class PowerCutError(BaseException):
 def content(result: Any) -> dict[str, Any]:
     """Return a result's arrays and its report without durations."""
     scenes = {"splats": result.splats, "simplified": getattr(result, "simplified", result.splats)}
-    arrays = {f"{key}.{name}": getattr(each, name) for key, each in scenes.items() for name in ARRAYS}
+    arrays = {
+        f"{key}.{name}": getattr(each, name) for key, each in scenes.items() for name in ARRAYS
+    }
     return {**arrays, "report": _timeless(result.report.as_dict())}
 
 
@@ -175,7 +182,11 @@ def test_after_ctrl_c_at_any_report(name: str, tmp_path: Path) -> None:
         calls, progress = counted(lambda: None)
 
         def press(
-            *_: Any, calls: list[int] = calls, progress: Any = progress, moment: int = moment, **__: Any
+            *_: Any,
+            calls: list[int] = calls,
+            progress: Any = progress,
+            moment: int = moment,
+            **__: Any,
         ) -> None:
             progress()
             if calls[0] == moment:
@@ -187,7 +198,9 @@ def test_after_ctrl_c_at_any_report(name: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_after_a_power_cut_at_any_file(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_after_a_power_cut_at_any_file(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Checkpoints are written after every step here. The cut comes after a file is renamed or removed."""
     call = CASES[name]
     whole = content(call(None, lambda *_: None))

@@ -33,7 +33,9 @@ def crowded() -> Cameras:
     crowd = [look_at([3, 0, 0.5] + 0.05 * rng.standard_normal(3), [0, 0, 0]) for _ in range(20)]
     poses = [*even.viewmats, *crowd, look_at([30.0, 0, 0], [60, 0, 0])]
     n = len(poses)
-    return Cameras.from_lists(poses, [even.Ks[0]] * n, [(64, 48)] * n, [f"v{i:02d}" for i in range(n)])
+    return Cameras.from_lists(
+        poses, [even.Ks[0]] * n, [(64, 48)] * n, [f"v{i:02d}" for i in range(n)]
+    )
 
 
 class Watched(TeacherRenders):
@@ -57,7 +59,9 @@ def test_all_views_are_drawn_by_weight_unless_told_otherwise() -> None:
     assert said.left_out == 0
     plain = distill(PRIOR, 200, targets, changed(SHORT, {"select.weighted": False}))
     assert plain.report.views is None
-    assert any(not np.array_equal(getattr(done.splats, a), getattr(plain.splats, a)) for a in ARRAYS)
+    assert any(
+        not np.array_equal(getattr(done.splats, a), getattr(plain.splats, a)) for a in ARRAYS
+    )
 
 
 def test_only_chosen_views_are_looked_at_and_the_rest_is_accounted_for() -> None:
@@ -78,7 +82,9 @@ def test_given_weights_stand() -> None:
     with pytest.raises(InputError, match="expected 12"):
         distill(PRIOR, 200, targets, SHORT, weights=[1.0])
     with pytest.raises(InputError, match="policy"):
-        distill(PRIOR, 200, targets, changed(SHORT, {"select.views_count": 3, "select.policy": "best"}))
+        distill(
+            PRIOR, 200, targets, changed(SHORT, {"select.views_count": 3, "select.policy": "best"})
+        )
 
 
 def test_views_are_selected_once_by_default(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -93,7 +99,8 @@ def test_views_are_selected_once_by_default(monkeypatch: pytest.MonkeyPatch) -> 
 
     monkeypatch.setattr(stage, "select", counted)
     config = changed(
-        SHORT, {"select.views_count": 6, "recover.schedule": replace(TUNED, steps=10, round_steps=5)}
+        SHORT,
+        {"select.views_count": 6, "recover.schedule": replace(TUNED, steps=10, round_steps=5)},
     )
     targets = TeacherRenders(PRIOR, crowded())
     distill(PRIOR, 600, targets, config)
@@ -106,7 +113,18 @@ def test_views_are_selected_once_by_default(monkeypatch: pytest.MonkeyPatch) -> 
 def test_the_command_reports_unchosen_views(command_line: CommandLine, tmp_path: Path) -> None:
     write_splats(tmp_path / "ball.ply", PRIOR)
     write_views(tmp_path / "pool.json", crowded())
-    ask = ("distill", "ball.ply", "-n", 200, "--views", "pool.json", "--method", "paper", "--steps", 20)
+    ask = (
+        "distill",
+        "ball.ply",
+        "-n",
+        200,
+        "--views",
+        "pool.json",
+        "--method",
+        "paper",
+        "--steps",
+        20,
+    )
     out, error = succeeds(
         command_line, tmp_path, *ask, "--set", "views_count=0.25", "-o", "run", "--json", "-"
     )

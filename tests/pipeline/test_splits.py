@@ -80,13 +80,29 @@ def watch(monkeypatch: pytest.MonkeyPatch) -> Watch:
     watched(g2ard.jobs.recover, "optimize", 1, seen.trained)
     watched(g2ard.pipeline.steps, "recover", 1, seen.trained)
     watched(g2ard.pipeline.dense, "visibility_source", 0, seen.looked)
-    for module in (g2ard.stages.evaluate, g2ard.jobs.scoring, g2ard.jobs.levels, g2ard.jobs.recover):
+    for module in (
+        g2ard.stages.evaluate,
+        g2ard.jobs.scoring,
+        g2ard.jobs.levels,
+        g2ard.jobs.recover,
+    ):
         watched(module, "evaluate", 1, seen.scored)
     return seen
 
 
 def test_select_chooses_training_views_and_keeps_the_rest(folder: Path, g2ard: Program) -> None:
-    g2ard("select", "ball.ply", "--views", "photos", "-k", 6, "-o", "chosen.json", "--json", "said.json")
+    g2ard(
+        "select",
+        "ball.ply",
+        "--views",
+        "photos",
+        "-k",
+        6,
+        "-o",
+        "chosen.json",
+        "--json",
+        "said.json",
+    )
     said = json.loads((folder / "said.json").read_text())
     order = [view["name"] for view in said["views"]]
     found = read_view_set(folder / "chosen.json")
@@ -118,7 +134,9 @@ def test_select_out_of_a_selection_and_out_of_other_splits(folder: Path, g2ard: 
     assert read_view_set(folder / "test.json").splits == ("test",) * 4
 
 
-def test_no_command_trains_on_what_a_selection_holds_out(folder: Path, g2ard: Program, watch: Watch) -> None:
+def test_no_command_trains_on_what_a_selection_holds_out(
+    folder: Path, g2ard: Program, watch: Watch
+) -> None:
     g2ard("select", "ball.ply", "--views", "photos", "-k", 6, "-o", "chosen.json")
     chosen = set(read_view_set(folder / "chosen.json").cameras.names[:6])
     g2ard("simplify", "ball.ply", "-n", 300, "--views", "chosen.json", "-o", "simplified.ply")
@@ -134,7 +152,9 @@ def test_no_command_trains_on_what_a_selection_holds_out(folder: Path, g2ard: Pr
     assert {p.name for p in (folder / "renders").iterdir()} == TEST
 
 
-def test_no_command_trains_on_what_a_split_file_holds_out(folder: Path, g2ard: Program, watch: Watch) -> None:
+def test_no_command_trains_on_what_a_split_file_holds_out(
+    folder: Path, g2ard: Program, watch: Watch
+) -> None:
     g2ard("recover", "small.ply", "--views", "photos", "--steps", 4, "-o", "recovered.ply")
     few = ("-n", 200, "--views", "photos", "--steps", 4)
     g2ard("distill", "ball.ply", *few, "-o", "run", "--set", "views_count=5")
@@ -144,7 +164,9 @@ def test_no_command_trains_on_what_a_split_file_holds_out(folder: Path, g2ard: P
     assert set().union(*watch.scored) == TEST
 
 
-def test_views_and_held_out_views_given_together(folder: Path, g2ard: Program, watch: Watch) -> None:
+def test_views_and_held_out_views_given_together(
+    folder: Path, g2ard: Program, watch: Watch
+) -> None:
     g2ard("select", "ball.ply", "--views", "photos", "-k", 6, "-o", "chosen.json")
     chosen = set(read_view_set(folder / "chosen.json").cameras.names[:6])
     ask = ("distill", "ball.ply", "-n", 200, "--steps", 4)
@@ -157,10 +179,14 @@ def test_views_and_held_out_views_given_together(folder: Path, g2ard: Program, w
     score = {"test": str(folder / "photos")}
     scene = SceneSpec("ball", str(folder / "ball.ply"), str(folder / "chosen.json"), score)
     place = Workspace(folder / "work", read_study(DEFINITIONS / "recover-curves.toml"), scene)
-    assert [set(part.names) for part in (place.train_cameras, place.scored["test"])] == [chosen, TEST]
+    assert [set(part.names) for part in (place.train_cameras, place.scored["test"])] == [
+        chosen,
+        TEST,
+    ]
     g2ard(*ask, "--held-out", "photos", "-o", "pool")
     assert [part for part in watch.scored if part == TEST] == [TEST] * 4
-    pool = read_view_set(folder / "pool" / "views.json", unpictured=True)  # only held-out views have photos
+    # only held-out views have photos
+    pool = read_view_set(folder / "pool" / "views.json", unpictured=True)
     assert set(pool.splits) == {"train", "test"}
 
 
@@ -179,7 +205,8 @@ def test_a_held_out_view_never_trains(folder: Path, g2ard: Program, watch: Watch
 
 
 def test_pools_state_their_splits(folder: Path, g2ard: Program, watch: Watch) -> None:
-    (folder / "split.json").write_text(json.dumps({"train": ["a"], "test": ["b"]}))  # of something else
+    # of something else
+    (folder / "split.json").write_text(json.dumps({"train": ["a"], "test": ["b"]}))
     g2ard("poses", "ball.ply", "-k", 24, "-o", "poses.json")
     g2ard("distill", "ball.ply", "-n", 200, "--steps", 4, "--size", 64, "-o", "run")
     for path, count in ((folder / "poses.json", 24), (folder / "run" / "views.json", 48)):
@@ -198,14 +225,40 @@ def test_a_split_that_is_not_stated_is_one_line(command_line: CommandLine, folde
     for ask in (
         ("evaluate", "small.ply", *look),
         ("recover", "small.ply", *look, "--split", "test", "-o", "out.ply"),
-        ("select", "ball.ply", "--views", "train.json", "-k", 2, "--split", "test", "-o", "out.json"),
+        (
+            "select",
+            "ball.ply",
+            "--views",
+            "train.json",
+            "-k",
+            2,
+            "--split",
+            "test",
+            "-o",
+            "out.json",
+        ),
         ("distill", "ball.ply", "-r", 10, "--views", "train.json", "-o", "run"),
     ):
         status, _, error = command_line(*ask, cwd=folder)
         assert status == 1
-        assert error.strip().splitlines()[-1] == "g2ard: train.json: no split 'test' (there are train)"
-    ask = ("distill", "ball.ply", "-r", 10, "--views", "photos", "--held-out", "train.json", "-o", "run")
-    assert "train.json: all of its 16 views are for training" in refused(command_line, folder, *ask, status=1)
+        assert (
+            error.strip().splitlines()[-1] == "g2ard: train.json: no split 'test' (there are train)"
+        )
+    ask = (
+        "distill",
+        "ball.ply",
+        "-r",
+        10,
+        "--views",
+        "photos",
+        "--held-out",
+        "train.json",
+        "-o",
+        "run",
+    )
+    assert "train.json: all of its 16 views are for training" in refused(
+        command_line, folder, *ask, status=1
+    )
 
 
 def test_training_on_test_views_is_noted(command_line: CommandLine, folder: Path) -> None:
@@ -213,7 +266,9 @@ def test_training_on_test_views_is_noted(command_line: CommandLine, folder: Path
     for command in ("recover", "adapt"):
         for split, words in (("all", "4 of the 16"), ("test", "4 of the 4"), ("train", None)):
             output = f"{command}-{split}.ply"
-            error = succeeds(command_line, folder, command, "small.ply", *look, output, "--split", split).err
+            error = succeeds(
+                command_line, folder, command, "small.ply", *look, output, "--split", split
+            ).err
             said = f"split {split}: {words} views trained on are test views"
             assert (said in error) if words else ("test views" not in error)
 
@@ -229,11 +284,18 @@ def test_splits_of_views() -> None:
 
 
 def test_a_name_in_both_splits_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "split.json").write_text(json.dumps({"train": ["a", "b.jpg"], "test": ["b"], "ood": ["a"]}))
-    for ask in (lambda: split_mask(tmp_path, ["a", "b"], "train"), lambda: splits_of(tmp_path, ["a", "b"])):
+    (tmp_path / "split.json").write_text(
+        json.dumps({"train": ["a", "b.jpg"], "test": ["b"], "ood": ["a"]})
+    )
+    for ask in (
+        lambda: split_mask(tmp_path, ["a", "b"], "train"),
+        lambda: splits_of(tmp_path, ["a", "b"]),
+    ):
         with pytest.raises(InputError, match=r"split\.json lists 'b' as both train and test"):
             ask()
-    (tmp_path / "split.json").write_text(json.dumps({"train": ["a"], "test": ["b"], "ood": ["a", "c"]}))
+    (tmp_path / "split.json").write_text(
+        json.dumps({"train": ["a"], "test": ["b"], "ood": ["a", "c"]})
+    )
     assert splits_of(tmp_path, ["a", "b", "c", "d"]) == ("train", "test", "ood", None)
 
 

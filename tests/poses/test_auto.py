@@ -37,7 +37,9 @@ def open_scene() -> Splats:
     r, t = 4 * np.sqrt((k + 0.5) / len(k)), k * 2.399963
     ground = np.stack([r * np.cos(t), r * np.sin(t), np.zeros(len(k))], axis=1)
     flat = naive.discs(ground, np.tile([0.0, 0.0, 1.0], (len(k), 1)), 0.06, seed=1)
-    columns = [naive.box((x, y, 0), (x + 0.5, y + 0.5, 2), 0.06) for x, y in ((-2, 1), (2, 1), (0, -2))]
+    columns = [
+        naive.box((x, y, 0), (x + 0.5, y + 0.5, 2), 0.06) for x, y in ((-2, 1), (2, 1), (0, -2))
+    ]
     up = fibonacci(400, low=0.0)
     return naive.joined(flat, *columns, naive.discs(6 * up, up, 2.0))
 
@@ -119,7 +121,8 @@ def test_a_coarse_object_is_still_seen_from_around() -> None:
 def test_a_thinned_object_is_still_seen_from_around() -> None:
     scene = read_splats(real("playbot/0_0"))
     thin = scene.take(np.arange(0, len(scene), 160))
-    thin = replace(thin, scales=thin.scales * np.float32(np.sqrt(160)))  # each is larger in its stead
+    # each is larger in its stead
+    thin = replace(thin, scales=thin.scales * np.float32(np.sqrt(160)))
     pool = plan_pool(thin, 24)
     assert len(pool.cameras) == 24
     assert pool.kind.startswith("orbit")

@@ -21,7 +21,8 @@ def _most_shown(scene: Splats, cameras: Cameras) -> np.ndarray:
 
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize(
-    ("name", "unit"), [*((name, 1.0) for name in SCENES), ("1", 1e4), ("2", 1e-3), ("on a plane", 1e4)]
+    ("name", "unit"),
+    [*((name, 1.0) for name in SCENES), ("1", 1e4), ("2", 1e-3), ("on a plane", 1e4)],
 )
 def test_views_of_a_degenerate_scene_show_it(name: str, unit: float) -> None:
     scene, _ = in_units(SCENES[name], around(1), unit)

@@ -42,7 +42,10 @@ def test_grid_equals_its_naive_twin(monkeypatch) -> None:
     ways /= np.linalg.norm(ways, axis=1, keepdims=True)
     got = grid.cast(eyes, ways)
     want = np.array(
-        [naive.first_hit(opaque, grid.low, grid.cell, e, w) for e, w in zip(eyes, ways, strict=True)]
+        [
+            naive.first_hit(opaque, grid.low, grid.cell, e, w)
+            for e, w in zip(eyes, ways, strict=True)
+        ]
     )
     assert 10 < np.isfinite(want).sum() < 60
     hit = np.isfinite(want) & np.isfinite(got)
@@ -67,7 +70,8 @@ def test_cast_equals_its_naive_twin_bit_for_bit() -> None:
     at, towards = rng.uniform(-1, 2, (4000, 3)), rng.uniform(0, 1, (4000, 3))
     eyes, ways = low + cell * np.array(shape) * at, cell * np.array(shape) * (towards - at)
     ways[:500] = np.eye(3)[rng.integers(3, size=500)] * rng.choice([-1.0, 1.0], (500, 1))
-    eyes[:100] = low + cell * np.array(shape) * rng.integers(0, 2, (100, 3))  # along edges, from corners
+    # along edges, from corners
+    eyes[:100] = low + cell * np.array(shape) * rng.integers(0, 2, (100, 3))
     ways /= np.linalg.norm(ways, axis=1, keepdims=True)
     want = naive.cast_rays(steps, low, cell, eyes, ways)
     assert 300 < np.isfinite(want).sum() < 3500
@@ -105,7 +109,9 @@ def test_terrain_is_bilinear_between_blocks_and_flat_beyond_the_edge() -> None:
     terrain = Terrain(np.array([2.0, -1.0]), 0.5, heights)
     x, y = rng.uniform(1.5, 5.0, 300), rng.uniform(-1.5, 1.5, 300)
     found = terrain.height(np.stack([x, y, rng.normal(size=300)], axis=1))
-    middles = [terrain.low[k] + (np.arange(heights.shape[k]) + 0.5) * terrain.block for k in range(2)]
+    middles = [
+        terrain.low[k] + (np.arange(heights.shape[k]) + 0.5) * terrain.block for k in range(2)
+    ]
     for at in range(300):
         along_y = [np.interp(y[at], middles[1], row) for row in heights]
         assert found[at] == pytest.approx(np.interp(x[at], middles[0], along_y), abs=1e-12)
@@ -142,7 +148,9 @@ def test_glances_tell_fine_matter_by_its_angle() -> None:
     away = np.linalg.norm(points, axis=1)
     scene = Splats.create(points, scales=np.repeat((angles * away)[:, None], 3, axis=1))
     views = views_at([np.eye(4)], (96, 72), 80.0)
-    single = np.array([Glance(scene.take(slice(i, i + 1))).of(views)[0, 0] for i in range(len(angles))])
+    single = np.array(
+        [Glance(scene.take(slice(i, i + 1))).of(views)[0, 0] for i in range(len(angles))]
+    )
     mean, fine, coarse = Glance(scene).of(views)[:, 0]
     assert mean == pytest.approx(single.sum(), rel=0.05)
     assert fine == pytest.approx(single[:3].sum(), rel=0.05)
@@ -161,7 +169,9 @@ def test_a_wide_disc_fills_the_cells_around_its_centre(monkeypatch) -> None:
     filled = np.argwhere(grid.opaque == 0)
     centres = grid.low + (filled + 0.5) * grid.cell
     reach = np.abs(centres).max(axis=0) / matter.scales[0, 2]
-    np.testing.assert_allclose(centres[:, :2].min(axis=0), -centres[:, :2].max(axis=0), atol=grid.cell)
+    np.testing.assert_allclose(
+        centres[:, :2].min(axis=0), -centres[:, :2].max(axis=0), atol=grid.cell
+    )
     np.testing.assert_allclose(reach[:2], [1.4, 0.9], atol=0.2)
 
 

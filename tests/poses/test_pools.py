@@ -80,12 +80,16 @@ def test_auto_pools_are_whole_upright_free_and_see_the_scene(name, turned, scene
     assert (tops > -1e-6).all()
     assert (tops > 0.3).mean() > 0.5
     within = pool.kind == "inside"  # a wall at arm's length shows few means, but fills the frame
-    seen = share_in_frame(naive.moved(scenes[name], turn, 1.0, shift), pool.cameras, 1 if within else 5)
+    seen = share_in_frame(
+        naive.moved(scenes[name], turn, 1.0, shift), pool.cameras, 1 if within else 5
+    )
     assert seen.min() > (0.5 if within else 0.25)
     assert np.median(seen) > (0.9 if within else 0.4)
 
 
-@pytest.mark.parametrize(("name", "kind"), [("statue", "orbit"), ("town", "aerial"), ("town", "walk")])
+@pytest.mark.parametrize(
+    ("name", "kind"), [("statue", "orbit"), ("town", "aerial"), ("town", "walk")]
+)
 def test_a_stated_kind_is_kept(name, kind, scenes) -> None:
     pool = plan_pool(scenes[name], 24, kind=kind)
     eyes, ahead = pool.cameras.positions, pool.cameras.forwards[:, 2]
@@ -189,7 +193,9 @@ def test_floaters_and_sky_do_not_move_the_cameras(scenes) -> None:
     clean = scenes["statue"]
     rng = np.random.default_rng(0)
     far = Splats.create(
-        rng.normal(size=(60, 3)) * 6e4, scales=rng.uniform(10, 500, (60, 3)), sh0=rng.normal(size=(60, 1, 3))
+        rng.normal(size=(60, 3)) * 6e4,
+        scales=rng.uniform(10, 500, (60, 3)),
+        sh0=rng.normal(size=(60, 1, 3)),
     )
     dome = naive.discs(60 * fibonacci(600), fibonacci(600), 4.0)
     odd = plan_pool(naive.joined(clean, far, dome), 32)
@@ -265,7 +271,8 @@ def test_invisible_scenes_are_refused(splats) -> None:
 
 
 @pytest.mark.parametrize(
-    "wrong", [("-k", "0"), ("--kind", "spiral"), ("--size", "800x"), ("--up", "0,0"), ("--up", "0,0,0")]
+    "wrong",
+    [("-k", "0"), ("--kind", "spiral"), ("--size", "800x"), ("--up", "0,0"), ("--up", "0,0,0")],
 )
 def test_command_usage(wrong, command_line: CommandLine, tmp_path: Path) -> None:
     status, _, error = command_line("poses", "scene.ply", "-o", "p.json", *wrong, cwd=tmp_path)
@@ -275,13 +282,17 @@ def test_command_usage(wrong, command_line: CommandLine, tmp_path: Path) -> None
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize(("size", "pixels"), [(None, (800, 600)), ("64", (64, 48)), ("48x64", (48, 64))])
+@pytest.mark.parametrize(
+    ("size", "pixels"), [(None, (800, 600)), ("64", (64, 48)), ("48x64", (48, 64))]
+)
 def test_size_is_a_longer_side_or_both(
     size: str | None, pixels: tuple[int, int], command_line: CommandLine, tmp_path: Path
 ) -> None:
     write_splats(tmp_path / "scene.ply", one())
     given = () if size is None else ("--size", size)
-    assert command_line("poses", "scene.ply", "-k", "2", *given, "-o", "p.json", cwd=tmp_path)[0] == 0
+    assert (
+        command_line("poses", "scene.ply", "-k", "2", *given, "-o", "p.json", cwd=tmp_path)[0] == 0
+    )
     views = read_views(tmp_path / "p.json")
     assert {*zip(views.widths.tolist(), views.heights.tolist(), strict=True)} == {pixels}
 
@@ -344,7 +355,9 @@ def test_a_grown_pool_keeps_the_kinds_of_the_first(monkeypatch: pytest.MonkeyPat
     assert found.kind == "orbit + sharp"
 
 
-def test_a_larger_pool_keeps_poses_of_kinds_that_it_would_not_use(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_larger_pool_keeps_poses_of_kinds_that_it_would_not_use(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """Poses that the larger number judges otherwise stay; the rest is evenly spread over the new ones."""
     planned = pool_module._plan
 

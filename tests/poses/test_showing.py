@@ -79,7 +79,9 @@ def subject(splats: Splats) -> np.ndarray:
 
 def least_angle(cameras: Cameras) -> float:
     cosines = cameras.forwards @ cameras.forwards.T
-    return float(np.degrees(np.arccos(np.clip(cosines[~np.eye(len(cameras), dtype=bool)].max(), -1, 1))))
+    return float(
+        np.degrees(np.arccos(np.clip(cosines[~np.eye(len(cameras), dtype=bool)].max(), -1, 1)))
+    )
 
 
 @pytest.mark.parametrize("name", SCENES)
@@ -164,7 +166,9 @@ def test_photos_that_cut_their_subject_come_last() -> None:
         for i, a in enumerate(np.linspace(0, 5, 6))
     ]
     cut = [
-        replace(view, viewmat=Camera.facing(0.6 * view.position, (0, 0, 0.3)).viewmat, name=f"cut {i}")
+        replace(
+            view, viewmat=Camera.facing(0.6 * view.position, (0, 0, 0.3)).viewmat, name=f"cut {i}"
+        )
         for i, view in enumerate(views[:2])
     ]
     assert all("whole" in name for name in best_views(statue, 4, Cameras.of([*cut, *views])).names)

@@ -20,7 +20,9 @@ def voted(splats: Splats) -> Votes:
     order = canonical_order(splats, np.arange(len(splats)))
     scales = np.sort(splats.scales[order].astype(np.float64), axis=1)
     sizes = np.sqrt(scales[:, 1] * scales[:, 2])
-    return Votes.of(splats.means[order].astype(np.float64), sizes, splats.opacities[order].astype(np.float64))
+    return Votes.of(
+        splats.means[order].astype(np.float64), sizes, splats.opacities[order].astype(np.float64)
+    )
 
 
 def test_votes_are_the_share_of_rows_above_a_pixel() -> None:
@@ -38,7 +40,8 @@ def test_votes_are_the_share_of_rows_above_a_pixel() -> None:
 SHARES = [0.05, 0.1, 0.3, 0.33, 0.35, 0.6, 0.8]
 DISTANCES = [4, 5, 60, 500, 1e4]
 SKIES = [
-    (share, distance, -1.0 if (row + column) % 2 else 0.0)  # whole spheres and their upper halves in turn
+    # whole spheres and their upper halves in turn
+    (share, distance, -1.0 if (row + column) % 2 else 0.0)
     for row, share in enumerate(SHARES)
     for column, distance in enumerate(DISTANCES)
 ]

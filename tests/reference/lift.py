@@ -17,7 +17,11 @@ def discs(points, neighbors=10, normal_ratio=0.1, max_anisotropy=4.0, spread=0.9
     def parallel(row, others):
         return np.abs(axes[others, 0] @ axes[row, 0]) > TURNED
 
-    most = [row for row in np.flatnonzero(thin) if (thin[near[row]] & parallel(row, near[row])).mean() > 0.5]
+    most = [
+        row
+        for row in np.flatnonzero(thin)
+        if (thin[near[row]] & parallel(row, near[row])).mean() > 0.5
+    ]
     lines = np.array(most, int)
     begin, end = (np.frexp(wide[lines] * f)[1] - 1 for f in (0.5, 16))
     inner, edges = set(), {}
@@ -34,7 +38,11 @@ def discs(points, neighbors=10, normal_ratio=0.1, max_anisotropy=4.0, spread=0.9
             wide[row] = full / np.sqrt(1 + np.log(overlap))
 
     for level in range(min(begin, default=0), max(end, default=-1) + 1):
-        active = [at for at in range(len(lines)) if lines[at] not in inner and begin[at] <= level <= end[at]]
+        active = [
+            at
+            for at in range(len(lines))
+            if lines[at] not in inner and begin[at] <= level <= end[at]
+        ]
         if not active:
             continue
         size = 2.0**level
@@ -43,7 +51,8 @@ def discs(points, neighbors=10, normal_ratio=0.1, max_anisotropy=4.0, spread=0.9
         )
         cell = cell.ravel()
         means = (
-            np.stack([np.bincount(cell, points[lines, k]) for k in range(3)], 1) / np.bincount(cell)[:, None]
+            np.stack([np.bincount(cell, points[lines, k]) for k in range(3)], 1)
+            / np.bincount(cell)[:, None]
         )
         around, frames, beside = _extents(means, 2 * neighbors, 5 * size)
         found = []
@@ -87,7 +96,11 @@ def _extents(points, neighbors, reach):
     rows = [np.zeros(0, int)] * len(points)
     for i, p in enumerate(points):
         d2 = ((points - p) ** 2).sum(1)
-        order = np.lexsort((np.arange(len(points)), d2)) if len(points) < 500 else _first(d2, neighbors + 1)
+        order = (
+            np.lexsort((np.arange(len(points)), d2))
+            if len(points) < 500
+            else _first(d2, neighbors + 1)
+        )
         near = order[order != i][:neighbors]
         near = near[d2[near] <= reach**2]
         if reach < np.inf and len(near) < neighbors // 4:

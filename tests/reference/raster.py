@@ -35,7 +35,13 @@ def sh_basis(d: Tensor, count: int) -> Tensor:
     xx, yy, zz = x * x, y * y, z * z
     one = torch.ones_like(x)
     b = [0.28209479177387814 * one, -C1 * y, C1 * z, -C1 * x]
-    b += [C2[0] * x * y, -C2[0] * y * z, C2[1] * (2 * zz - xx - yy), -C2[0] * x * z, C2[2] * (xx - yy)]
+    b += [
+        C2[0] * x * y,
+        -C2[0] * y * z,
+        C2[1] * (2 * zz - xx - yy),
+        -C2[0] * x * z,
+        C2[2] * (xx - yy),
+    ]
     b += [-C3[0] * y * (3 * xx - yy), C3[1] * x * y * z, -C3[2] * y * (4 * zz - xx - yy)]
     b += [C3[3] * z * (2 * zz - 3 * xx - 3 * yy), -C3[2] * x * (4 * zz - xx - yy)]
     b += [C3[1] / 2 * z * (xx - yy), -C3[0] * x * (xx - 3 * yy)]
@@ -109,7 +115,9 @@ def render(
         opacity = opacity * (ratio.clamp(min=2.5e-5) if inria else ratio).sqrt()
 
     py, px = torch.meshgrid(
-        torch.arange(height, dtype=x.dtype) + 0.5, torch.arange(width, dtype=x.dtype) + 0.5, indexing="ij"
+        torch.arange(height, dtype=x.dtype) + 0.5,
+        torch.arange(width, dtype=x.dtype) + 0.5,
+        indexing="ij",
     )
     dx, dy = px.reshape(1, -1) - u[:, None], py.reshape(1, -1) - v[:, None]
     q = (C[:, None] * dx * dx - 2 * B[:, None] * dx * dy + A[:, None] * dy * dy) / det[:, None]
@@ -173,7 +181,9 @@ def render(
     )
 
 
-def inria_tiles(u: Tensor, v: Tensor, A: Tensor, C: Tensor, det: Tensor, width: int, height: int) -> Tensor:
+def inria_tiles(
+    u: Tensor, v: Tensor, A: Tensor, C: Tensor, det: Tensor, width: int, height: int
+) -> Tensor:
     """(N, P): pixels in the 16×16 tiles that INRIA's kernel walks for each splat."""
     mid = 0.5 * (A + C)
     radius = torch.ceil(3 * torch.sqrt(mid + torch.sqrt(torch.clamp(mid**2 - det, min=0.1))))

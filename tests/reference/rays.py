@@ -20,7 +20,9 @@ def median_depths(splats, viewmat, K, size, pixels):
     u = np.clip(x / z, (-cx - 0.15 * width) / fx, (width - cx + 0.15 * width) / fx)
     v = np.clip(y / z, (-cy - 0.15 * height) / fy, (height - cy + 0.15 * height) / fy)
     zero = np.zeros_like(z)
-    J = np.stack([np.stack([fx / z, zero, -fx * u / z], -1), np.stack([zero, fy / z, -fy * v / z], -1)], 1)
+    J = np.stack(
+        [np.stack([fx / z, zero, -fx * u / z], -1), np.stack([zero, fy / z, -fy * v / z], -1)], 1
+    )
     axes = rotations(splats.quats[order].astype(np.float64))
     half = J @ viewmat[:3, :3] @ axes * splats.scales[order].astype(np.float64)[:, None, :]
     cov = half @ half.transpose(0, 2, 1) + 0.3 * np.eye(2)
@@ -29,7 +31,10 @@ def median_depths(splats, viewmat, K, size, pixels):
     out = np.zeros(len(pixels))
     for i, (px, py) in enumerate(pixels):
         dx, dy = px - (fx * x / z + cx), py - (fy * y / z + cy)
-        power = 0.5 * (inverse[:, 0, 0] * dx * dx + inverse[:, 1, 1] * dy * dy) + inverse[:, 0, 1] * dx * dy
+        power = (
+            0.5 * (inverse[:, 0, 0] * dx * dx + inverse[:, 1, 1] * dy * dy)
+            + inverse[:, 0, 1] * dx * dy
+        )
         alpha = np.minimum(opacity * np.exp(-power), 0.99)
         light = np.cumsum(np.log1p(-np.where(alpha < 1 / 255, 0.0, alpha)))
         past = np.searchsorted(-light, np.log(2), side="right")
@@ -64,7 +69,9 @@ def agreement(splats, surface, cameras, seen, cells, tolerance):
         near, far = depth.min(1), depth.max(1)
         smooth = (far - near < 0.01 * np.maximum(near, 1e-300)) | (far == 0)
         z = z[there]
-        want = (depth[:, 0] > 0) & (np.abs(z - depth[:, 0]) <= np.maximum(surface.size, tolerance * z))
+        want = (depth[:, 0] > 0) & (
+            np.abs(z - depth[:, 0]) <= np.maximum(surface.size, tolerance * z)
+        )
         got = np.isin(np.asarray(cells)[there], seen[1][slice(*seen[0][i : i + 2])])
         agree += int((want == got)[smooth].sum())
         kept, total = kept + int(smooth.sum()), total + len(z)

@@ -11,7 +11,9 @@ def pixel_row(u, v, depth, K, gradient):  # type: ignore[no-untyped-def]
     """∇I · (∂π/∂X · [I | −[X]ₓ], change by the focal length's logarithm) of the pixel with centre (u, v)."""
     X = depth * (np.linalg.inv(K) @ np.array([u, v, 1.0]))
     x, y, z = X
-    projection = np.array([[K[0, 0] / z, 0, -K[0, 0] * x / z**2], [0, K[1, 1] / z, -K[1, 1] * y / z**2]])
+    projection = np.array(
+        [[K[0, 0] / z, 0, -K[0, 0] * x / z**2], [0, K[1, 1] / z, -K[1, 1] * y / z**2]]
+    )
     motion = np.hstack([np.eye(3), -cross(X)])
     zoom = [u - K[0, 2], v - K[1, 2]]
     return np.asarray(gradient) @ np.column_stack([projection @ motion, zoom])

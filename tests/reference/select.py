@@ -25,7 +25,9 @@ def median_depth(splats, viewmat, K, pixels):
             @ viewmat[:3, :3]
         )
         R = rotations(splats.quats[i].astype(np.float64))
-        cov = J @ R @ np.diag(splats.scales[i].astype(np.float64) ** 2) @ R.T @ J.T + 0.3 * np.eye(2)
+        cov = J @ R @ np.diag(splats.scales[i].astype(np.float64) ** 2) @ R.T @ J.T + 0.3 * np.eye(
+            2
+        )
         dx, dy = (pixels - [K[0, 0] * x / z + K[0, 2], K[1, 1] * y / z + K[1, 2]]).T
         (a, b), (_, c) = np.linalg.inv(cov)
         power = 0.5 * (a * dx * dx + c * dy * dy) + b * dx * dy
@@ -104,7 +106,10 @@ def represent(k, alike, wanted, shares):
     chosen = [
         int(
             np.argmax(
-                [worth[v] / sum(wanted[u] * away[u, v] for u in range(len(alike))) for v in range(len(alike))]
+                [
+                    worth[v] / sum(wanted[u] * away[u, v] for u in range(len(alike)))
+                    for v in range(len(alike))
+                ]
             )
         )
     ]

@@ -28,7 +28,10 @@ def merge(splats, rows):
     w = m / m.sum()
     x = splats.means[rows].astype(np.float64)
     mean = w @ x
-    cov = sum(w[k] * (covariance(splats, i) + np.outer(x[k] - mean, x[k] - mean)) for k, i in enumerate(rows))
+    cov = sum(
+        w[k] * (covariance(splats, i) + np.outer(x[k] - mean, x[k] - mean))
+        for k, i in enumerate(rows)
+    )
     values = np.linalg.eigvalsh(cov)
     area = np.sqrt(max(values[2], 0) * max(values[1], 0))
     alpha = min(0.99, 1 - np.exp(-m.sum() / area))
@@ -64,7 +67,9 @@ def coverage(splats, rows, support=3.0):
     normal, plane = axes[:, 0], axes[:, :0:-1]
     areas = np.array([footprint(splats.scales[i]) for i in rows])
     covs = [covariance(splats, i) for i in rows]
-    extent = np.sqrt(sum(a * (normal @ c @ normal) for a, c in zip(areas, covs, strict=True)) / areas.sum())
+    extent = np.sqrt(
+        sum(a * (normal @ c @ normal) for a, c in zip(areas, covs, strict=True)) / areas.sum()
+    )
     covered = 0.0
     for i, c in zip(rows, covs, strict=True):
         offset = splats.means[i].astype(np.float64) - mean
@@ -93,7 +98,9 @@ def surface_depths(splats):
         for j in np.argsort(np.linalg.norm(means - means[i], axis=1), kind="stable")[:25]:
             if j != i:
                 d = plane.T @ (means[i] - means[j])
-                out[i] += alphas[j] * np.exp(-0.5 * d @ np.linalg.solve(plane.T @ covs[j] @ plane, d))
+                out[i] += alphas[j] * np.exp(
+                    -0.5 * d @ np.linalg.solve(plane.T @ covs[j] @ plane, d)
+                )
     return out
 
 

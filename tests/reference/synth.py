@@ -5,7 +5,9 @@ import numpy as np
 from benchmarks.synth.shapes import Kind, Shapes
 
 
-def first_hits(shapes: Shapes, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def first_hits(
+    shapes: Shapes, origins: np.ndarray, directions: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Return t (n,) and primitive (n,) of the first hits of rays (n, 3); inf and −1 without a hit."""
     best, hit = np.full(len(directions), np.inf), np.full(len(directions), -1)
     for p in range(len(shapes)):
@@ -49,7 +51,10 @@ def _crossings(kind, lo, hi, o, d):
         if kind == Kind.BOX:
             return _box(lo, hi, o, d)
         if kind in (Kind.GABLE_X, Kind.GABLE_Y):
-            return [_triangle(*corners, o, d) for corners in _roof(lo, hi, 0 if kind == Kind.GABLE_X else 1)]
+            return [
+                _triangle(*corners, o, d)
+                for corners in _roof(lo, hi, 0 if kind == Kind.GABLE_X else 1)
+            ]
         return _round(kind, (lo + hi) / 2, (hi - lo) / 2, o, d)
 
 

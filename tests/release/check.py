@@ -27,7 +27,9 @@ LARGEST = 150e6
 def use_section() -> tuple[list[list[str]], str]:
     """Return the commands and the Python example of README's *Use* section."""
     section = README.read_text(encoding="utf-8").split("\n## Use\n")[1].split("\n## ")[0]
-    shell, python = (re.findall(rf"(?ms)^```{kind}\n(.*?)^```", section)[0] for kind in ("sh", "python"))
+    shell, python = (
+        re.findall(rf"(?ms)^```{kind}\n(.*?)^```", section)[0] for kind in ("sh", "python")
+    )
     commands = [shlex.split(line, comments=True) for line in shell.splitlines()]
     return [words for words in commands if words], python
 
@@ -43,10 +45,15 @@ def environment(folder: Path, package: Path) -> dict[str, str]:
     print(f"{package.name}: {added / 1e6:.0f} MB with its dependencies")
     if added > LARGEST:
         raise SystemExit(f"{package.name}: more than {LARGEST / 1e6:.0f} MB")
-    if subprocess.run([python, "-c", "import torch"], capture_output=True, check=False).returncode == 0:
+    if (
+        subprocess.run([python, "-c", "import torch"], capture_output=True, check=False).returncode
+        == 0
+    ):
         raise SystemExit(f"{package.name}: brings torch along")
     variables = {
-        name: value for name, value in os.environ.items() if name not in {"PYTHONPATH", "PYTHONHOME"}
+        name: value
+        for name, value in os.environ.items()
+        if name not in {"PYTHONPATH", "PYTHONHOME"}
     }
     return {**variables, "PATH": os.pathsep.join([str(programs), os.environ["PATH"]])}
 
@@ -75,7 +82,9 @@ def outputs(package: Path, folder: Path) -> dict[str, str]:
             check=False,
         )
         if done.returncode:
-            raise SystemExit(f"{package.name}: {shlex.join(words)}: status {done.returncode}\n{done.stderr}")
+            raise SystemExit(
+                f"{package.name}: {shlex.join(words)}: status {done.returncode}\n{done.stderr}"
+            )
 
     def hashed(path: Path) -> str:
         return hashlib.sha256(path.read_bytes()).hexdigest()

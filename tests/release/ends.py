@@ -50,14 +50,19 @@ TO_COME = tuple(f"python3.{minor}" for minor in range(20, 10, -1))
 
 def lowest() -> list[str]:
     """Return the package's requirements at their lower bounds."""
-    return [re.sub(r">=([\w.]+).*", r"==\1", requirement) for requirement in PROJECT["dependencies"]]
+    return [
+        re.sub(r">=([\w.]+).*", r"==\1", requirement) for requirement in PROJECT["dependencies"]
+    ]
 
 
 def newest_python() -> str:
     """Return the newest Python on PATH that runs."""
     for name in TO_COME:
         path = shutil.which(name)
-        if path and subprocess.run([path, "-c", "import venv"], capture_output=True).returncode == 0:
+        if (
+            path
+            and subprocess.run([path, "-c", "import venv"], capture_output=True).returncode == 0
+        ):
             return path
     return sys.executable
 
@@ -95,8 +100,14 @@ def main(end: str, wheel: Path) -> None:
         pins = lowest() if end == "oldest" else ["--upgrade"]
         subprocess.run([*pip, "install", "--quiet", str(wheel.resolve()), *pins], check=True)
         listed = subprocess.run([*pip, "list"], check=True, capture_output=True, text=True).stdout
-        version = subprocess.run([programs / "python", "-V"], capture_output=True, text=True).stdout.strip()
-        print(f"{end}: {version}", *(" ".join(line.split()) for line in listed.splitlines()[2:]), sep=", ")
+        version = subprocess.run(
+            [programs / "python", "-V"], capture_output=True, text=True
+        ).stdout.strip()
+        print(
+            f"{end}: {version}",
+            *(" ".join(line.split()) for line in listed.splitlines()[2:]),
+            sep=", ",
+        )
         variables = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
         variables |= {"TERM": "xterm-256color", "COLUMNS": "80", "LINES": "24"}
         work.mkdir()

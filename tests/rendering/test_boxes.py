@@ -31,7 +31,9 @@ def cut(splats: Splats, boxes: int) -> KdTree:
     return cut_tree(splats.means, 1.0, -(-len(splats) // boxes))
 
 
-def drawn(splats: Splats, tree: KdTree, view: Camera, settings: RasterSettings | None = None) -> Canvas:
+def drawn(
+    splats: Splats, tree: KdTree, view: Camera, settings: RasterSettings | None = None
+) -> Canvas:
     """Draw every box from the rows that reach it."""
     settings = settings_for(splats.means, settings)
     canvas = Canvas.blank(view)
@@ -43,7 +45,9 @@ def drawn(splats: Splats, tree: KdTree, view: Camera, settings: RasterSettings |
 
 
 def assert_same_image(canvas: Canvas, want: Rendered) -> None:
-    np.testing.assert_allclose(canvas.finished(), np.dstack([want.image, want.alpha]), rtol=0, atol=1e-5)
+    np.testing.assert_allclose(
+        canvas.finished(), np.dstack([want.image, want.alpha]), rtol=0, atol=1e-5
+    )
 
 
 def poses(rng: np.random.Generator, tree: KdTree) -> list[NDArray[np.float64]]:
@@ -146,7 +150,9 @@ def test_boxes_of_playbot_draw_the_whole(boxes: int) -> None:
 def test_the_rows_that_reach_a_box_are_all_it_needs() -> None:
     """Draw boxes of all rows, and of those that are named; images are equal, and not all rows are named."""
     splats = splats_of(scene(3, 2000, 0, size=0.02))
-    views = views_at([look_at([0, -6, 0], [0, 0, 0]), look_at([0.1, 0, 0], [1, 1, 0])], (64, 48), 55.0)
+    views = views_at(
+        [look_at([0, -6, 0], [0, 0, 0]), look_at([0.1, 0, 0], [1, 1, 0])], (64, 48), 55.0
+    )
     tree = cut(splats, 8)
     for box in tree.boxes():
         some = reaching(splats, views, box)

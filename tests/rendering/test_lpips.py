@@ -43,7 +43,11 @@ def maps(image: np.ndarray, backbone: dict) -> list[np.ndarray]:
         if i in (3, 6):
             x = pool(x)
         x = conv(
-            x, backbone[f"features.{i}.weight"].numpy(), backbone[f"features.{i}.bias"].numpy(), stride, pad
+            x,
+            backbone[f"features.{i}.weight"].numpy(),
+            backbone[f"features.{i}.bias"].numpy(),
+            stride,
+            pad,
         )
         out.append(x)
     return out
@@ -66,7 +70,9 @@ def test_the_distance_equals_a_naive_networks() -> None:
 def test_evaluate_scores_with_it() -> None:
     ball, views = checkered_ball(200), around(2)
     found = evaluate(
-        ball.take(slice(100)), TeacherRenders(ball, views), lpips={"alex": Lpips("alex", *weights())}
+        ball.take(slice(100)),
+        TeacherRenders(ball, views),
+        lpips={"alex": Lpips("alex", *weights())},
     )
     assert found.lpips["alex"] > 0
     assert found.as_dict()["lpips"] == found.lpips

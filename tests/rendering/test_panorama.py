@@ -17,10 +17,15 @@ from helpers.scenes import around, checkered_ball
 from helpers.view_files import edit, transforms
 
 BALL = checkered_ball(3000)
-POSES = [look_at([0.1, 0.2, -0.1], [1, 0.5, 0.3]), look_at([-0.2, 0, 0.3], [0, -0.1, -1], up=[0.2, 1, 0])]
+POSES = [
+    look_at([0.1, 0.2, -0.1], [1, 0.5, 0.3]),
+    look_at([-0.2, 0, 0.3], [0, -0.1, -1], up=[0.2, 1, 0]),
+]
 
 
-@pytest.mark.parametrize(("width", "rows"), [(8, slice(0, 4)), (64, slice(5, 9)), (100, slice(49, 50))])
+@pytest.mark.parametrize(
+    ("width", "rows"), [(8, slice(0, 4)), (64, slice(5, 9)), (100, slice(49, 50))]
+)
 def test_rays_are_those_of_the_lens(width: int, rows: slice) -> None:
     rays = panorama_rays(width, width // 2, rows)
     v, u = np.mgrid[rows, 0:width] + 0.5
@@ -30,7 +35,16 @@ def test_rays_are_those_of_the_lens(width: int, rows: slice) -> None:
     assert inside.all()
 
 
-CORNERS = [(1, 1, 1), (1, 1, 0), (0, 1, 1), (1, 0, -1), (0, 0, -1), (0, 1, 0), (0, -1, 0), (-1, -1, 1)]
+CORNERS = [
+    (1, 1, 1),
+    (1, 1, 0),
+    (0, 1, 1),
+    (1, 0, -1),
+    (0, 0, -1),
+    (0, 1, 0),
+    (0, -1, 0),
+    (-1, -1, 1),
+]
 
 
 @pytest.mark.parametrize("pose", POSES)
@@ -59,7 +73,9 @@ def test_faces_of_a_written_panorama_are_renders_of_the_scene(
     path = transforms(
         tmp_path / "transforms.json", POSES, camera_model="EQUIRECTANGULAR", w=width, h=width // 2
     )
-    edit(path, lambda c: [frame.update(file_path=f"{i}.png") for i, frame in enumerate(c["frames"])])
+    edit(
+        path, lambda c: [frame.update(file_path=f"{i}.png") for i, frame in enumerate(c["frames"])]
+    )
     renderer = g2ard.Renderer(BALL)
     for i, pose in enumerate(POSES):
         seen = renderer.panorama(Camera(pose, np.eye(3), 8, 8), width=width)
@@ -75,11 +91,23 @@ def test_faces_of_a_written_panorama_are_renders_of_the_scene(
 def test_command_line(tmp_path: Path, command_line: CommandLine, size: int) -> None:
     g2ard.save(tmp_path / "scene.ply", checkered_ball(200))
     g2ard.save_views(tmp_path / "views.json", around(2))
-    ask = ("render", "scene.ply", "--panorama", "--size", size, "--views", "views.json", "-o", "out")
+    ask = (
+        "render",
+        "scene.ply",
+        "--panorama",
+        "--size",
+        size,
+        "--views",
+        "views.json",
+        "-o",
+        "out",
+    )
     succeeds(command_line, tmp_path, *ask, "--depth", "--sheet", "sheet.png")
     names = g2ard.load_views(tmp_path / "views.json").names
     width = size // 2 * 2
-    assert {Image.open(tmp_path / "out" / f"{name}.png").size for name in names} == {(width, width // 2)}
+    assert {Image.open(tmp_path / "out" / f"{name}.png").size for name in names} == {
+        (width, width // 2)
+    }
     assert np.load(tmp_path / "out" / f"{names[0]}.depth.npy").shape == (width // 2, width)
     assert (tmp_path / "sheet.png").is_file()
     if size == 128:  # read in again, all faces of a photo give one panorama in its axes
@@ -88,7 +116,9 @@ def test_command_line(tmp_path: Path, command_line: CommandLine, size: int) -> N
         path = transforms(tmp_path / "transforms.json", poses, **shown)
         edit(
             path,
-            lambda c: [f.update(file_path=f"out/{n}.png") for f, n in zip(c["frames"], names, strict=True)],
+            lambda c: [
+                f.update(file_path=f"out/{n}.png") for f, n in zip(c["frames"], names, strict=True)
+            ],
         )
         again = ("--panorama", "--size", 128, "--views", "transforms.json", "-o", "two")
         succeeds(command_line, tmp_path, "render", "scene.ply", *again)

@@ -12,7 +12,16 @@ from g2ard.rendering.renderer import RasterSettings, arrays_of, render, settings
 from g2ard.rendering.visibility import visibility, visibility_source
 from g2ard.scene.cameras import Cameras, look_at
 from g2ard.stages.recover.rasterize import rasterize
-from helpers.raster_cases import NAMES, VARIANTS, Params, camera, oracle, scene, splats_of, tensors_of
+from helpers.raster_cases import (
+    NAMES,
+    VARIANTS,
+    Params,
+    camera,
+    oracle,
+    scene,
+    splats_of,
+    tensors_of,
+)
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
@@ -26,7 +35,9 @@ def test_image_is_the_oracle_s(variant: str, width: int, height: int, off: float
         p = scene(seed, n, degree=seed + 1, size=size)
         background = (0.2, 0.5, 0.9)
         want, _ = oracle(p, cameras, settings, background)
-        image, alpha, depth = rasterize(*tensors_of(p), cameras, 0, background=background, settings=settings)
+        image, alpha, depth = rasterize(
+            *tensors_of(p), cameras, 0, background=background, settings=settings
+        )
         sure = ~want.doubtful
         assert sure.double().mean() > 0.9
         for got, expected in ((image, want.image), (alpha, want.alpha), (depth, want.depth)):
@@ -58,13 +69,17 @@ def test_gradients_are_the_oracle_s(variant: str, degree: int) -> None:
         weights[want.doubtful.numpy()] = 0  # a flipped skip or stop is no gradient's fault
         w = torch.from_numpy(weights)
         loss = (
-            (want.image * w[..., :3]).sum() + (want.alpha * w[..., 3]).sum() + (want.depth * w[..., 4]).sum()
+            (want.image * w[..., :3]).sum()
+            + (want.alpha * w[..., 3]).sum()
+            + (want.depth * w[..., 4]).sum()
         )
         loss.backward()
         mine = tensors_of(p)
         image, alpha, depth = rasterize(*mine, cameras, 0, background=background, settings=settings)
         w = w.float()
-        ((image * w[..., :3]).sum() + (alpha * w[..., 3]).sum() + (depth * w[..., 4]).sum()).backward()
+        (
+            (image * w[..., :3]).sum() + (alpha * w[..., 3]).sum() + (depth * w[..., 4]).sum()
+        ).backward()
         for name, a, b in zip(NAMES, mine, tensors, strict=True):
             if not a.numel():
                 continue
@@ -80,7 +95,10 @@ def degenerate() -> dict[str, Params]:
     base["means"] *= 0.3
 
     def changed(**change: Any) -> Params:
-        return {k: np.broadcast_to(np.float32(change.get(k, v)), v.shape).copy() for k, v in base.items()}
+        return {
+            k: np.broadcast_to(np.float32(change.get(k, v)), v.shape).copy()
+            for k, v in base.items()
+        }
 
     needles = base["log_scales"].copy()
     needles[:] = [1.5, -12, -12]
@@ -100,7 +118,12 @@ def degenerate() -> dict[str, Params]:
         "saturated": changed(logit_opacities=40.0),
         "transparent": changed(logit_opacities=-40.0),
         "identical": changed(
-            means=[0.1, 0, 0], quats=[1, 0, 0, 0], log_scales=-2.0, logit_opacities=1.0, sh0=0.5, shN=0.1
+            means=[0.1, 0, 0],
+            quats=[1, 0, 0, 0],
+            log_scales=-2.0,
+            logit_opacities=1.0,
+            sh0=0.5,
+            shN=0.1,
         ),
         "zero quaternions": changed(quats=0.0),
         "tiny quaternions": changed(quats=[1e-30, 0, 2e-30, 0]),
@@ -116,7 +139,9 @@ def test_degenerate_scenes(name: str, variant: str) -> None:
     p = degenerate()[name]
     settings = VARIANTS[variant]
     K = [[40.0, 0, 20], [0, 40, 15], [0, 0, 1]]
-    cameras = Cameras.from_lists([look_at([0, 0, -2], [0, 0, 0], up=[0, -1, 0])], [K], [(40, 30)], ["v"])
+    cameras = Cameras.from_lists(
+        [look_at([0, 0, -2], [0, 0, 0], up=[0, -1, 0])], [K], [(40, 30)], ["v"]
+    )
     mine = tensors_of(p)
     image, alpha, depth = rasterize(*mine, cameras, 0, background=(1, 0, 0.5), settings=settings)
     (image.sum() + alpha.sum() + depth.square().sum()).backward()
@@ -142,7 +167,9 @@ def test_degenerate_scenes(name: str, variant: str) -> None:
 def test_nothing_to_see() -> None:
     p = scene(0, 0, 3)
     cameras = camera(20, 18)
-    image, alpha, depth = rasterize(*(mine := tensors_of(p)), cameras, 0, background=(0.25, 0.5, 0.75))
+    image, alpha, depth = rasterize(
+        *(mine := tensors_of(p)), cameras, 0, background=(0.25, 0.5, 0.75)
+    )
     assert torch.equal(image, torch.tensor([0.25, 0.5, 0.75]).expand(18, 20, 3))
     assert not alpha.any()
     assert not depth.any()

@@ -56,7 +56,9 @@ def test_light_that_passes_or_is_stopped_does_not_change_colours() -> None:
 
 def test_gaussians_that_no_view_shows_keep_their_colours() -> None:
     dense = checkered_ball(300).with_sh_degree(0)
-    far = Splats.create([[1e4] * 3], scales=[[0.01] * 3], logit_opacities=[9], sh0=[[[0.1, 0.2, 0.3]]])
+    far = Splats.create(
+        [[1e4] * 3], scales=[[0.01] * 3], logit_opacities=[9], sh0=[[[0.1, 0.2, 0.3]]]
+    )
     small = dense.take(np.arange(50))
     small = join([small, far])
     fitted = recoloured(dense, small, VIEWS)
@@ -71,7 +73,9 @@ def test_gaussians_that_views_hardly_show_hardly_change() -> None:
     dense = checkered_ball(300).with_sh_degree(0)
     dense = replace(dense, sh0=np.full((300, 1, 3), 0.7, np.float32))
     pale = replace(dense, sh0=dense.sh0 + np.float32(1))
-    speck = Splats.create([[0, 0, 1.3]], scales=[[2e-3] * 3], logit_opacities=[-3], sh0=[[[0.7] * 3]])
+    speck = Splats.create(
+        [[0, 0, 1.3]], scales=[[2e-3] * 3], logit_opacities=[-3], sh0=[[[0.7] * 3]]
+    )
     small = join([pale, speck])
     shift = (recoloured(dense, small, VIEWS).sh0 - small.sh0)[:, 0]
     assert np.median(shift[:-1]) < -0.5

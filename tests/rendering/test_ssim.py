@@ -140,7 +140,9 @@ def test_masked_ssim_is_between_minus_one_and_one_and_sees_the_mask_alone(
     assert loss == pytest.approx(1 - found, abs=1e-12)
     assert 0 <= _core.l1_ssim(a, b, 0.2, mask)[0] <= 1.8
     for spoilt in (np.nan, 1e30, 0.5):
-        other_a, other_b = (np.where(mask[..., None], image, np.float32(spoilt)) for image in (a, b))
+        other_a, other_b = (
+            np.where(mask[..., None], image, np.float32(spoilt)) for image in (a, b)
+        )
         assert ssim(other_a, b, mask) == ssim(a, other_b, mask) == found
         again, other_gradient = _core.l1_ssim(other_a, other_b, 1.0, mask)
         assert again == loss
@@ -204,7 +206,9 @@ def test_nan_is_no_perfect_score() -> None:
     spoilt[3, 4] = np.nan
     everywhere = np.ones(image.shape[:2], bool)
     for mask in (None, everywhere):
-        assert np.isnan([score(image, spoilt, mask) for score in (psnr, ssim, edge_psnr, detail)]).all()
+        assert np.isnan(
+            [score(image, spoilt, mask) for score in (psnr, ssim, edge_psnr, detail)]
+        ).all()
     targets = Spoilt(views)
     assert np.isnan(Probe(targets, BLACK).score(ball))
     assert np.isnan(Probe(targets, BLACK, 40.0).score(ball))
@@ -251,4 +255,9 @@ def test_detail_counts_as_lost_where_people_see_it() -> None:
     assert lost_detail(flat, faint) == 0  # nobody sees it
     assert lost_detail(textured + 0.02, textured) < 0.3  # brighter
     assert lost_detail(noisy, textured) < 0.3
-    assert 0 < lost_detail(flat + 0.04 * grain, textured) < 1 < lost_detail(flat + 0.01 * grain, textured)
+    assert (
+        0
+        < lost_detail(flat + 0.04 * grain, textured)
+        < 1
+        < lost_detail(flat + 0.01 * grain, textured)
+    )

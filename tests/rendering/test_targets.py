@@ -39,7 +39,9 @@ def test_renders_are_kept_in_16_bits() -> None:
     for i, view in enumerate(views):
         assert targets[i].dtype == np.float32
         assert 0 < np.abs(targets[i] - Renderer(ball).clipped(view)).max() <= 0.51 / 65535
-    assert sum(kept.nbytes for kept in targets._kept.values()) == 2 * 3 * sum(views.widths * views.heights)
+    assert sum(kept.nbytes for kept in targets._kept.values()) == 2 * 3 * sum(
+        views.widths * views.heights
+    )
 
 
 IMAGE_BYTES = 2 * 3 * 32 * 24
@@ -51,7 +53,9 @@ def test_targets_are_filled_once(limit: int, monkeypatch: pytest.MonkeyPatch) ->
     rendered: list[str] = []
     real = TeacherRenders._make
     monkeypatch.setattr(
-        TeacherRenders, "_make", lambda self, view: rendered.append(views.names[view]) or real(self, view)
+        TeacherRenders,
+        "_make",
+        lambda self, view: rendered.append(views.names[view]) or real(self, view),
     )
     targets = TeacherRenders(ball, views, limit=limit, lazy=True)
     targets[7]
@@ -80,7 +84,9 @@ def _refuse(**options: object) -> FileIO:
     raise OSError(errno.EROFS, "read-only file system")
 
 
-@pytest.mark.parametrize(("cause", "written"), [("no room", 0), ("read-only", 0), ("nearly full", 3)])
+@pytest.mark.parametrize(
+    ("cause", "written"), [("no room", 0), ("read-only", 0), ("nearly full", 3)]
+)
 def test_targets_are_made_again_if_the_disk_is_full(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cause: str, written: int
 ) -> None:
@@ -94,7 +100,9 @@ def test_targets_are_made_again_if_the_disk_is_full(
     monkeypatch.setattr(f"g2ard.system.spill.{name}", double)
     rendered: list[object] = []
     real = Renderer.clipped
-    monkeypatch.setattr(Renderer, "clipped", lambda self, view: rendered.append(view) or real(self, view))
+    monkeypatch.setattr(
+        Renderer, "clipped", lambda self, view: rendered.append(view) or real(self, view)
+    )
     targets = TeacherRenders(ball, views, limit=5 * IMAGE_BYTES + 99)
     rendered.clear()
     fill(targets, silent)
@@ -160,7 +168,9 @@ def test_a_target_from_the_file_can_be_changed() -> None:
     np.testing.assert_array_equal(targets[0], first)
 
 
-@pytest.mark.skipif(not Path("/proc/self/fd").exists(), reason="open files cannot be counted on this system")
+@pytest.mark.skipif(
+    not Path("/proc/self/fd").exists(), reason="open files cannot be counted on this system"
+)
 def test_the_file_disappears_with_its_targets() -> None:
     def opened() -> int:
         return len(list(Path("/proc/self/fd").iterdir()))
@@ -236,10 +246,18 @@ def test_the_fingerprint_of_any_class_is_that_of_its_images() -> None:
         "renders": lambda: TeacherRenders(ball, views),
         "photos": lambda: Photos(views, list(images)),
         "other photos": lambda: Photos(views, list(other)),
-        **{f"part {row}": lambda row=row: Subset(Photos(twins, list(images)), [row]) for row in range(3)},
-        **{f"own {row}": lambda row=row: Subset(checked_targets(Plain(images)), [row]) for row in (0, 1)},
+        **{
+            f"part {row}": lambda row=row: Subset(Photos(twins, list(images)), [row])
+            for row in range(3)
+        },
+        **{
+            f"own {row}": lambda row=row: Subset(checked_targets(Plain(images)), [row])
+            for row in (0, 1)
+        },
     }
-    first, again = ([fingerprint_of(checked_targets(make())) for make in made.values()] for _ in range(2))
+    first, again = (
+        [fingerprint_of(checked_targets(make())) for make in made.values()] for _ in range(2)
+    )
     assert first == again
     for i, name in enumerate(made):
         same = [other for other, key in zip(made, first, strict=True) if key == first[i]]

@@ -37,7 +37,20 @@ def run(command_line: CommandLine, folder: Path, *arguments: object) -> tuple[di
 
 
 def test_distill_learns_from_photos_and_renders(folder: Path, command_line: CommandLine) -> None:
-    ask = ("distill", "ball.ply", "-r", 3, "--views", "v.json", "-o", "run", "--steps", 4, "--size", 48)
+    ask = (
+        "distill",
+        "ball.ply",
+        "-r",
+        3,
+        "--views",
+        "v.json",
+        "-o",
+        "run",
+        "--steps",
+        4,
+        "--size",
+        48,
+    )
     report, told = run(command_line, folder, *ask)
     assert "8 training views against 4 photos and 4 renders of the dense scene" in told
     assert "skipped" not in told

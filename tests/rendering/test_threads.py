@@ -47,7 +47,9 @@ def test_one_renderer_renders_as_in_one_thread() -> None:
     alone = [Renderer(BALL).image(view) for view in VIEWS]
     shared = Renderer(BALL)
     for _ in range(3):
-        for thread, images in enumerate(at_once(lambda t: [shared.image(VIEWS[i]) for i in in_turn(8, t)])):
+        for thread, images in enumerate(
+            at_once(lambda t: [shared.image(VIEWS[i]) for i in in_turn(8, t)])
+        ):
             for view, image in zip(in_turn(8, thread), images, strict=True):
                 np.testing.assert_array_equal(image, alone[view])
 
@@ -128,6 +130,8 @@ def test_a_trainer_takes_every_step() -> None:
 def test_every_class_of_the_extension_is_usable_from_threads() -> None:
     """PyO3 refuses a second caller of a class that is not frozen: "Already borrowed"."""
     sources = sorted((ROOT / "rust" / "g2ard-py" / "src").glob("*.rs"))
-    classes = [line for path in sources for line in path.read_text().splitlines() if "#[pyclass" in line]
+    classes = [
+        line for path in sources for line in path.read_text().splitlines() if "#[pyclass" in line
+    ]
     assert len(classes) >= 6
     assert [line for line in classes if "frozen" not in line] == []

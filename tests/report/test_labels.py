@@ -10,7 +10,14 @@ from helpers.photos import cloud_of
 from helpers.scenes import checkered_ball
 
 GENERIC = [
-    *("scene.ply", "scene.sog", "scene.compressed.ply", "point_cloud.ply", "points3D.bin", "model.splat"),
+    *(
+        "scene.ply",
+        "scene.sog",
+        "scene.compressed.ply",
+        "point_cloud.ply",
+        "points3D.bin",
+        "model.splat",
+    ),
     *("0_0", "0", "7.ply", "lod-meta.json", "iteration_7000", "Output.PLY", "simplified"),
 ]
 

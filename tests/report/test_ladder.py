@@ -40,7 +40,10 @@ def rungs(*scores: tuple[float, float], against: str = "teacher") -> list[Rung]:
 @pytest.mark.parametrize(
     ("given", "told"),
     [
-        (rungs((0.2, 1.2), (0.1, 0.9), (0, 0.1)), "20× is the smallest without a visible loss of detail"),
+        (
+            rungs((0.2, 1.2), (0.1, 0.9), (0, 0.1)),
+            "20× is the smallest without a visible loss of detail",
+        ),
         (rungs((0.3, 0.9), (0.1, 0.2)), "40× is the smallest .*; fewer Gaussians may do"),
         (rungs((2, 3), (1.1, 0.8)), "every size loses detail visibly, 20× most in a; keep more .*"),
         (
@@ -68,7 +71,11 @@ def test_people_see_lost_grain_but_no_copy(
     scene = g2ard.load(real(name))
     targets = g2ard.TeacherRenders(scene, g2ard.make_pool(scene, 16, size=(800, 600)).take(shown))
     g2ard.save(tmp_path / "copy.spz", scene)
-    few = g2ard.load(tmp_path / "copy.spz") if ratio == 1 else g2ard.simplify(scene, ratio=ratio, blind=True)
+    few = (
+        g2ard.load(tmp_path / "copy.spz")
+        if ratio == 1
+        else g2ard.simplify(scene, ratio=ratio, blind=True)
+    )
     worst = max(view.lost for view in g2ard.evaluate(few, targets).views)
     assert worst > 1 if seen else worst < 0.2
 
@@ -82,7 +89,9 @@ def sizes(tmp_path: Path) -> Path:
     (tmp_path / "photos").mkdir()
     g2ard.save_views(tmp_path / "photos.json", photographed(tmp_path / "photos", BALL, views))
     for count in (10, 150):
-        g2ard.save(tmp_path / f"s_{count}.ply", g2ard.simplify(BALL, count=count, blind=True).splats)
+        g2ard.save(
+            tmp_path / f"s_{count}.ply", g2ard.simplify(BALL, count=count, blind=True).splats
+        )
     return tmp_path
 
 
@@ -118,6 +127,15 @@ def test_evaluate_writes_a_page_on_several_sizes(
 
 
 def test_a_page_compares_at_least_two(sizes: Path, command_line: CommandLine) -> None:
-    ask = ("evaluate", "s_10.ply", "--teacher", "ball.ply", "--views", "views.json", "-o", "ladder.html")
+    ask = (
+        "evaluate",
+        "s_10.ply",
+        "--teacher",
+        "ball.ply",
+        "--views",
+        "views.json",
+        "-o",
+        "ladder.html",
+    )
     assert "several scenes" in refused(command_line, sizes, *ask)
     assert not (sizes / "ladder.html").exists()

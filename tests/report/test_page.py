@@ -18,10 +18,13 @@ def test_distill_writes_a_report(command_line: CommandLine, tmp_path: Path) -> N
     succeeds(command_line, tmp_path, "distill", "ball.ply", *options)
     html = (tmp_path / "run" / "report.html").read_text()
     check_page(html)
-    assert re.search(r'<p class="lead">300 of 1,200 Gaussians reproduce the dense scene at \d+\.\d dB', html)
+    assert re.search(
+        r'<p class="lead">300 of 1,200 Gaussians reproduce the dense scene at \d+\.\d dB', html
+    )
     assert html.index("<table>") < html.index("Worst views")
     worst = [
-        float(found) for found in re.findall(r"<option[^>]*>result (\S+) dB", html[html.index("Worst") :])
+        float(found)
+        for found in re.findall(r"<option[^>]*>result (\S+) dB", html[html.index("Worst") :])
     ]
     assert len(worst) == 3
     assert worst == sorted(worst)
@@ -50,12 +53,16 @@ def test_the_verdict_names_the_weakest_kind_of_view() -> None:
     report = _report(**counts, against="renders", kinds=summarize_by_kind(VIEWS, VIEWS))
     told = "9 of 90 Gaussians reproduce the dense scene at 29.8 dB, the mean of 5 held-out views of 48×36 px"
     assert summarize_run(report) == f"{told}; near views are weakest (27.0 dB)."
-    assert summarize_run(replace(report, kinds=())) == "9 Gaussians; no held-out view shows the scene."
+    assert (
+        summarize_run(replace(report, kinds=())) == "9 Gaussians; no held-out view shows the scene."
+    )
     of_photos = summarize_run(replace(report, lifted=True, against="photos"))
     assert of_photos.startswith("9 Gaussians from 90 points reproduce the photos at")
     full = Means(26.04, 0.8, 30, 0.9, scored_in="5 photos, 96×72 px")
     told = summarize_run(replace(report, own_size={"recovered": full}))
-    assert "at 26.0 dB in 5 photos, 96×72 px, the views' own size; at 29.8 dB, the mean of 5" in told
+    assert (
+        "at 26.0 dB in 5 photos, 96×72 px, the views' own size; at 29.8 dB, the mean of 5" in told
+    )
     sizes = {"simplified": replace(full, psnr=24.5), "recovered": full}
     first, *others = list_rows(replace(report, own_size=sizes))
     assert first[:3] == ["full size", "5", "24.50 → 26.04"]

@@ -21,14 +21,18 @@ def opened(browser: Browser, page: Page, path: Path, width: int = 1000) -> None:
     page.write(path)
     browser.resize(width, 640)
     browser.open(path.as_uri())
-    browser.run("new Promise(done => { onload = done; document.readyState === 'complete' && done() })")
+    browser.run(
+        "new Promise(done => { onload = done; document.readyState === 'complete' && done() })"
+    )
 
 
 ROW = ["anywhere", "128", "29.34 → 32.27", "27.01", "0.79 → 0.86", "0.7896 → 0.8607"]
 
 
 @pytest.mark.parametrize("width", [360, 1000])
-def test_tables_fit_the_window_and_name_their_columns(browser: Browser, width: int, tmp_path: Path) -> None:
+def test_tables_fit_the_window_and_name_their_columns(
+    browser: Browser, width: int, tmp_path: Path
+) -> None:
     page = Page("scene.ply: 500,000 → 50,000", "A verdict of a sentence.")
     page.table(COLUMNS, [ROW, ROW])
     opened(browser, page, tmp_path / "report.html", width)
@@ -51,8 +55,11 @@ def test_pictures_are_no_taller_than_the_screen(
     opened(browser, page, tmp_path / "report.html")
     heights = "[...document.querySelectorAll('img')].map(e => e.getBoundingClientRect().height)"
     assert 0 < max(browser.run(heights)) <= 640
-    assert browser.run("document.querySelector('.tag.right').textContent") == "one 9 dB"  # by the script
-    pictures = browser.run("document.querySelectorAll('img[src^=\"data:image/jpeg;base64,\"]').length")
+    # by the script
+    assert browser.run("document.querySelector('.tag.right').textContent") == "one 9 dB"
+    pictures = browser.run(
+        "document.querySelectorAll('img[src^=\"data:image/jpeg;base64,\"]').length"
+    )
     assert pictures == 8  # a pair and two crops of three
 
 

@@ -19,7 +19,14 @@ from helpers.peers import adobe_spz, splat_transform
 from reference.raster import sh_basis
 from reference.rotations import covariances
 
-WORLD = {"R": [1, 0, 0], "L": [-1, 0, 0], "U": [0, 1, 0], "D": [0, -1, 0], "B": [0, 0, 1], "F": [0, 0, -1]}
+WORLD = {
+    "R": [1, 0, 0],
+    "L": [-1, 0, 0],
+    "U": [0, 1, 0],
+    "D": [0, -1, 0],
+    "B": [0, 0, 1],
+    "F": [0, 0, -1],
+}
 """Directions of the letters, written out, in the world right, up, back."""
 
 
@@ -111,7 +118,9 @@ def test_extension_records_are_checked(tmp_path: Path) -> None:
         path.write_bytes(data[:32] + struct.pack("<III", kind, 4, number) + data[44:])
         return path
 
-    assert [note.code for note in read_scene(with_record(0xADBE0002, 1)).notes] == ["ignored_extensions"]
+    assert [note.code for note in read_scene(with_record(0xADBE0002, 1)).notes] == [
+        "ignored_extensions"
+    ]
     assert len(read_splats(with_record(0xADBE0003, 0))) == 40
     with pytest.raises(InputError, match="unknown coordinate system 17"):
         read_splats(with_record(0xADBE0003, 17))
@@ -126,7 +135,9 @@ def test_convert_stores_other_axes(command_line: CommandLine, tmp_path: Path) ->
         succeeds(command_line, tmp_path, "convert", "a.ply", name, "--to-axes", "rfu")
     expected = with_axes(scene(), change_of_axes("RDF", "RFU"))
     np.testing.assert_allclose(read_splats(tmp_path / "b.ply").shN, expected.shN, atol=1e-6)
-    line = refused(command_line, tmp_path, "convert", "a.ply", "b.glb", "--to-axes", "RFU", status=1)
+    line = refused(
+        command_line, tmp_path, "convert", "a.ply", "b.glb", "--to-axes", "RFU", status=1
+    )
     assert "LUF axes by definition" in line
     succeeds(command_line, tmp_path, "convert", "a.ply", "b.glb", "--to-axes", "LUF")
     succeeds(command_line, tmp_path, "convert", "a.ply", "b.spz", "--to-axes", "LBU")
@@ -150,5 +161,6 @@ def test_splat_transform_reads_and_writes_spz_with_the_axes_of_a_ply(
         read = read_splats(tmp_path / name)
         rows, others = (np.lexsort(np.round(s.means, 2).T) for s in (read, scene()))
         got, want = world(read.take(rows), "RDF"), world(scene().take(others), "RDF")
-        for mine, other, near in zip(got, want, (1e-3, 0.05, 0.5), strict=True):  # scales are rounded by 3 %
+        # scales are rounded by 3 %
+        for mine, other, near in zip(got, want, (1e-3, 0.05, 0.5), strict=True):
             np.testing.assert_allclose(mine, other, atol=near, rtol=0.07)

@@ -37,14 +37,19 @@ NOT_FINITE, NO_FOCAL = (
         (values("viewmats", 1e200, 2, 0, 0), "above 1e+12"),
         (values("Ks", 2e12, 2, 1, 1), "above 1e+12"),
         (values("widths", 0, 2), f"has an empty image, 0×{VIEWS.heights[2]}"),
-        (values("widths", 2**62, 2), f"has {2**62:,}×{VIEWS.heights[2]} pixels; the limit is 160,000,000"),
+        (
+            values("widths", 2**62, 2),
+            f"has {2**62:,}×{VIEWS.heights[2]} pixels; the limit is 160,000,000",
+        ),
         (values("Ks", 0, 2, 0, 0), NO_FOCAL),
         (values("Ks", -50, 2, 1, 1), NO_FOCAL),
         (values("Ks", 0, 2, 0, 0) | values("viewmats", np.nan, 3, 0, 0), NO_FOCAL),
         (values("viewmats", np.nan, 2, 0, 0) | values("widths", 0, 2), NOT_FINITE),
     ],
 )
-def test_the_first_fault_of_the_first_wrong_view_is_told(fields: Mapping[str, Any], fault: str) -> None:
+def test_the_first_fault_of_the_first_wrong_view_is_told(
+    fields: Mapping[str, Any], fault: str
+) -> None:
     with pytest.raises(InputError) as caught:
         replace(VIEWS, **fields)
     assert fault in str(caught.value)

@@ -57,7 +57,9 @@ def test_scenes_around_the_origin_keep_their_offset() -> None:
         g2ard.RecoverConfig(schedule=PAPER.scaled(60)),
     ],
 )
-def test_recovery_in_map_coordinates_is_that_of_the_centred_scene(config: g2ard.RecoverConfig) -> None:
+def test_recovery_in_map_coordinates_is_that_of_the_centred_scene(
+    config: g2ard.RecoverConfig,
+) -> None:
     student = g2ard.simplify(BALL, ratio=5).splats
     far_views = VIEWS.recentred(-UTM)
     near = g2ard.recover(student, TeacherRenders(BALL, VIEWS), config)
@@ -109,7 +111,9 @@ def test_writers_store_map_coordinates_with_an_offset(tmp_path: Path, suffix: st
     rows = np.lexsort(np.round(worlds(again) - UTM, 2).T), np.lexsort(np.round(BALL.means, 2).T)
     found, wanted = (worlds(again) - UTM)[rows[0]], BALL.means[rows[1]]
     lossy = suffix in ("sog", "compressed.ply", "spz")
-    assert np.abs(np.sort(found, axis=0) - np.sort(wanted, axis=0)).max() < (0.02 if lossy else 1e-5)
+    assert np.abs(np.sort(found, axis=0) - np.sort(wanted, axis=0)).max() < (
+        0.02 if lossy else 1e-5
+    )
 
 
 @pytest.mark.parametrize("suffix", ["ply", "compressed.ply", "sog", "glb", "splat"])
@@ -174,7 +178,11 @@ def test_levels_of_map_coordinates_stand_where_they_belong(tmp_path: Path, kind:
     assert [line for line in lines if "rounded by up to" in line] == [
         f"note: {said[0].message}".replace("far", "told")
     ]
-    names = [path.relative_to(tmp_path / "near") for path in (tmp_path / "near").rglob("*") if path.is_file()]
+    names = [
+        path.relative_to(tmp_path / "near")
+        for path in (tmp_path / "near").rglob("*")
+        if path.is_file()
+    ]
     for name in names:
         assert (tmp_path / "far" / name).read_bytes() == (tmp_path / "near" / name).read_bytes()
 

@@ -94,7 +94,11 @@ def test_masks_survive_g2ard_s_own_file(tmp_path: Path) -> None:
 def test_transforms_json_names_masks(tmp_path: Path) -> None:
     photographed(tmp_path, spoil=1.0, masks=False)
     write_png(tmp_path / "m.png", np.eye(48, 64))
-    frame = {"file_path": "images/view_000.png", "transform_matrix": np.eye(4).tolist(), "mask_path": "m.png"}
+    frame = {
+        "file_path": "images/view_000.png",
+        "transform_matrix": np.eye(4).tolist(),
+        "mask_path": "m.png",
+    }
     (tmp_path / "transforms.json").write_text(json.dumps({"fl_x": 50, "frames": [frame]}))
     cameras = io.read_view_set(tmp_path / "transforms.json").cameras
     mask = load_mask(cameras, 0)
@@ -129,7 +133,9 @@ def of_targets(cameras: Cameras) -> list[NDArray[Any]]:
 def of_registration(cameras: Cameras) -> list[NDArray[Any]]:
     photos = [loaded(cameras, view, RegisterConfig(), BLACK) for view in range(len(cameras))]
     levels = [level.grey for photo in photos for _, level in photo.pyramid]
-    return [array for photo in photos for array in (photo.image, photo.small[1], photo.whole)] + levels
+    return [
+        array for photo in photos for array in (photo.image, photo.small[1], photo.whole)
+    ] + levels
 
 
 @pytest.mark.parametrize("reader", [of_points, of_targets, of_registration])
@@ -156,7 +162,9 @@ def test_hidden_pixels_do_not_matter(
         cameras = replace(cameras, distortions=np.tile([0.3, 0, 0, 0, 0], (len(cameras), 1)))
     masks = [load_mask(cameras, view) for view in range(len(cameras))]
     assert all(0.1 < mask.mean() < 0.9 for mask in masks[1::2] if mask is not None)
-    assert len([mask for mask in masks if mask is not None]) == (5 if hidden == "every second" else 10)
+    assert len([mask for mask in masks if mask is not None]) == (
+        5 if hidden == "every second" else 10
+    )
     read, found = photos._load_image, []
     for colour in (0.2, 0.5):
 
@@ -199,8 +207,12 @@ def test_metrics_use_unmasked_pixels_only() -> None:
 def test_exposures_are_undone(tmp_path: Path) -> None:
     cameras = photographed(tmp_path, masks=False)
     plain = Photos(cameras)[1]
-    matrix: NDArray[np.float64] = np.array([[0.8, 0, 0.1, 0.02], [0, 0.7, 0, 0.05], [0, 0.1, 0.9, 0]])
-    write_png(tmp_path / "images" / "view_001.png", plain @ matrix[:, :3].T + matrix[:, 3], overwrite=True)
+    matrix: NDArray[np.float64] = np.array(
+        [[0.8, 0, 0.1, 0.02], [0, 0.7, 0, 0.05], [0, 0.1, 0.9, 0]]
+    )
+    write_png(
+        tmp_path / "images" / "view_001.png", plain @ matrix[:, :3].T + matrix[:, 3], overwrite=True
+    )
     (tmp_path / "exposure.json").write_text(json.dumps({"view_001.png": matrix.tolist()}))
     found = find_exposures(cameras)
     assert list(found) == ["view_001"]

@@ -75,7 +75,12 @@ def test_stops_once_it_has_converged_and_not_before() -> None:
     ],
 )
 def test_steps_follow_the_number_of_images(
-    count: int, given: dict[str, float], said: str, taken: int, command_line: CommandLine, tmp_path: Path
+    count: int,
+    given: dict[str, float],
+    said: str,
+    taken: int,
+    command_line: CommandLine,
+    tmp_path: Path,
 ) -> None:
     """The ball is there already, so that it stops as soon as it may."""
     ball = checkered_ball(60)
@@ -83,7 +88,9 @@ def test_steps_follow_the_number_of_images(
     g2ard.save_views(tmp_path / "views.json", VIEWS.take(range(count)).resized(16))
     ask = ("adapt", "ball.ply", "--teacher", "ball.ply", "--views", "views.json", "--split", "all")
     words = [word for name, value in given.items() for word in (f"--{name}", value)]
-    told = succeeds(command_line, tmp_path, *ask, *words, "-o", "out.ply", "--json", "told.json").err
+    told = succeeds(
+        command_line, tmp_path, *ask, *words, "-o", "out.ply", "--json", "told.json"
+    ).err
     assert f"{said}\n" in told
     assert json.loads((tmp_path / "told.json").read_text())["steps"] == taken
     planned = succeeds(command_line, tmp_path, *ask, *words, "--dry-run", "--json", "plan.json")
@@ -96,7 +103,9 @@ def test_few_images_are_not_learnt_by_heart() -> None:
     compact = simplify(ball, 200).splats
     targets = TeacherRenders(replace(ball, sh0=np.abs(ball.sh0)), VIEWS.resized(32))
     some, others = Subset(targets, [0, 3]), Subset(targets, [1, 2, 4, 23])
-    few, many = (adapt(compact, some, AdaptConfig(**how)) for how in ({}, {"steps": 2000, "tolerance": 0.0}))
+    few, many = (
+        adapt(compact, some, AdaptConfig(**how)) for how in ({}, {"steps": 2000, "tolerance": 0.0})
+    )
     assert few.report.steps == 250
     assert evaluate(few.splats, others).psnr > evaluate(many.splats, others).psnr
     assert evaluate(few.splats, others).psnr > evaluate(compact, others).psnr
@@ -114,7 +123,12 @@ def test_gives_a_flat_scene_bands_of_its_own() -> None:
 
 
 def test_invalid_options_are_rejected() -> None:
-    for wrong in ({"steps": 0}, {"tolerance": -1.0}, {"tolerance": float("nan")}, {"schedule": "best"}):
+    for wrong in (
+        {"steps": 0},
+        {"tolerance": -1.0},
+        {"tolerance": float("nan")},
+        {"schedule": "best"},
+    ):
         with pytest.raises(InputError):
             AdaptConfig(**wrong)
 
@@ -151,7 +165,9 @@ def test_an_unchanged_light_gives_the_identity() -> None:
     ball = checkered_ball(500)
     change = fit_colour_change(ball, TeacherRenders(ball, VIEWS), (0.0, 0.0, 0.0))
     np.testing.assert_allclose(change.matrix, np.eye(3), atol=1e-5)  # targets have 16 bits
-    assert adapt(ball, TeacherRenders(ball, VIEWS), AdaptConfig(steps=5)).report.colour_change is None
+    assert (
+        adapt(ball, TeacherRenders(ball, VIEWS), AdaptConfig(steps=5)).report.colour_change is None
+    )
 
 
 def test_masked_pixels_are_ignored(tmp_path: Path) -> None:
@@ -211,7 +227,9 @@ def test_each_stretch_draws_views_in_another_order() -> None:
     """One seed for all stretches would omit the same views at the beginning of each."""
     seeds, ball = [], checkered_ball(40)
 
-    def recover(name: str, scene: Splats, targets: object, how: RecoverConfig, **_: object) -> object:
+    def recover(
+        name: str, scene: Splats, targets: object, how: RecoverConfig, **_: object
+    ) -> object:
         seeds.append(how.seed)
         return scene, SimpleNamespace(psnr=SimpleNamespace(before=0.0, after=1.0))
 

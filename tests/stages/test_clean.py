@@ -34,7 +34,9 @@ def junk() -> tuple[Splats, np.ndarray]:
 
     needles = Splats.create(2 * ends, quats=quats, scales=np.tile([0.002, 0.002, 0.1], (10, 1)))
     floaters = Splats.create(
-        [[1.8, 0, 0], [1.81, 0, 0], [0, -2, 0.5]], scales=np.full((3, 3), 0.01), logit_opacities=[2, 2, 2]
+        [[1.8, 0, 0], [1.81, 0, 0], [0, -2, 0.5]],
+        scales=np.full((3, 3), 0.01),
+        logit_opacities=[2, 2, 2],
     )
     parts = [ball, within, faint, giant, needles, floaters]
     kinds = np.repeat([-1, 0, 0, 1, 2, 3], [len(part) for part in parts])
@@ -45,7 +47,9 @@ def find(splats: Splats, **options: object):
     """Find clutter as if views could see all of the scene."""
     views = around(24)
     pixels = int((views.widths * views.heights).sum())
-    return find_clutter(splats, visibility(splats, views), np.ones(len(splats), bool), pixels, **options)
+    return find_clutter(
+        splats, visibility(splats, views), np.ones(len(splats), bool), pixels, **options
+    )
 
 
 def test_every_kind_is_found_and_the_ball_stays() -> None:
@@ -82,10 +86,14 @@ def test_gaussians_behind_a_wall_stay() -> None:
     """Gaussians behind the wall are in the frame, but no view sees them."""
     x, z = np.meshgrid(np.linspace(-3, 3, 61), np.linspace(-3, 3, 61))
     means = np.stack([x.ravel(), np.zeros(x.size), z.ravel()], 1)
-    wall = Splats.create(means, scales=np.full((x.size, 3), 0.1), logit_opacities=np.full(x.size, 9.0))
+    wall = Splats.create(
+        means, scales=np.full((x.size, 3), 0.1), logit_opacities=np.full(x.size, 9.0)
+    )
     beyond = replace(checkered_ball(500), logit_opacities=np.full(500, 5, np.float32))
     beyond = replace(beyond, means=beyond.means + np.float32([0, 3, 0]))
-    before = replace(wall.take([0]), means=np.float32([[0, -1, 0]]), logit_opacities=np.float32([-5.4]))
+    before = replace(
+        wall.take([0]), means=np.float32([[0, -1, 0]]), logit_opacities=np.float32([-5.4])
+    )
     scene = join([wall, beyond, before])
     view = views_at([look_at([0, -4, 0], [0, 0, 0])])
     unoccluded, _ = compare_depths(scene, view, floating=False)
@@ -100,7 +108,9 @@ def test_gaussians_behind_a_wall_stay() -> None:
 def test_a_chain_of_thin_gaussians_is_not_a_needle() -> None:
     """A string: each end lies inside the next Gaussian."""
     along = np.linspace(-1, 1, 21)[:, None] * [1, 0, 0]
-    string = Splats.create(along, scales=np.tile([0.05, 0.001, 0.001], (21, 1)), logit_opacities=[3] * 21)
+    string = Splats.create(
+        along, scales=np.tile([0.05, 0.001, 0.001], (21, 1)), logit_opacities=[3] * 21
+    )
     scene = join([checkered_ball(500), replace(string, means=string.means + np.float32([0, 0, 2]))])
     found = find(scene, kinds=("needle",))
     assert found.counts["needle"] <= 2  # the string's own ends
@@ -115,24 +125,33 @@ def veiled(ball: Splats) -> tuple[Splats, np.ndarray]:
     size, white = np.full((200, 3), 0.08), np.full((300, 1, 3), 1.5)
     haze = Splats.create(ways[:200] * rng.uniform(1.3, 1.8, (200, 1)), scales=size, sh0=white[:200])
     streaks = Splats.create(
-        1.2 * ways[200:], quats=quats[200:], scales=np.tile([0.006, 0.006, 0.1], (100, 1)), sh0=white[200:]
+        1.2 * ways[200:],
+        quats=quats[200:],
+        scales=np.tile([0.006, 0.006, 0.1], (100, 1)),
+        sh0=white[200:],
     )
     parts = [ball, replace(haze, logit_opacities=np.full(200, -2, np.float32)), streaks]
-    return join(parts), np.repeat([-1, KINDS.index("haze"), KINDS.index("streak")], list(map(len, parts)))
+    return join(parts), np.repeat(
+        [-1, KINDS.index("haze"), KINDS.index("streak")], list(map(len, parts))
+    )
 
 
 def test_strength_removes_haze_and_streaks_and_keeps_the_ball() -> None:
     ball = checkered_ball(2500)
     scene, kinds = veiled(ball)
     _, floating = compare_depths(scene, around(96))
-    found = [find(scene, kinds=FLOATING, floating=floating, strength=s) for s in (0, 0.25, 0.5, 0.75)]
+    found = [
+        find(scene, kinds=FLOATING, floating=floating, strength=s) for s in (0, 0.25, 0.5, 0.75)
+    ]
     shares = np.array([[(f.kind[kinds == kind] >= 0).mean() for kind in (-1, 4, 5)] for f in found])
     assert (shares[0] == 0).all()
     assert (np.diff(shares, axis=0) >= 0).all()
     assert shares[2, 0] < 0.01
     assert shares[2, 1:].min() > 0.8
     view = around(7)[3]
-    clear, veil, clean = (render(s, view).image.clip(0, 1) for s in (ball, scene, scene.take(found[2].keep)))
+    clear, veil, clean = (
+        render(s, view).image.clip(0, 1) for s in (ball, scene, scene.take(found[2].keep))
+    )
     assert psnr(clean, clear) > psnr(veil, clear) + 10
 
 
@@ -146,7 +165,9 @@ def test_the_sky_is_kept_apart_and_joined_again(tmp_path: Path, command_line: Co
     splats, _ = junk()
     rays = np.random.default_rng(1).normal(size=(400, 3))
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-    dome = Splats.create(60 * rays, scales=np.full((400, 3), 5.0), logit_opacities=np.full(400, 3.0))
+    dome = Splats.create(
+        60 * rays, scales=np.full((400, 3), 5.0), logit_opacities=np.full(400, 3.0)
+    )
     write_splats(tmp_path / "a.ply", join([splats, dome]))
     words = ["clean", "a.ply", "--split-sky", "sky.ply", "-o", "near.ply", "--only", "none"]
     told = succeeds(command_line, tmp_path, *words).err

@@ -25,9 +25,11 @@ INRIA = RasterSettings(convention="inria")
 
 
 def test_inrias_convention_reaches_renders_and_targets() -> None:
-    ball, views = checkered_ball(300), around(2, distance=1.15)  # nearer than 0.2 to some of the discs
+    # nearer than 0.2 to some of the discs
+    ball, views = checkered_ball(300), around(2, distance=1.15)
     own, theirs = (
-        evaluate(ball, TeacherRenders(ball, views, settings=s), settings=s).psnr for s in (None, INRIA)
+        evaluate(ball, TeacherRenders(ball, views, settings=s), settings=s).psnr
+        for s in (None, INRIA)
     )
     assert own == theirs == 100  # the same conventions on both sides
     mixed = evaluate(ball, TeacherRenders(ball, views), settings=INRIA)
@@ -90,11 +92,22 @@ def test_every_metric_has_a_field_and_a_column(command_line: CommandLine, folder
 def test_reports_state_file_sizes(command_line: CommandLine, folder: Path) -> None:
     assert command_line("convert", "ball.ply", "ball.sog", cwd=folder)[0] == 0
     assert command_line("convert", "ball.ply", "folder/meta.json", cwd=folder)[0] == 0
-    ask = ("evaluate", "ball.ply", "ball.sog", "folder", "--teacher", "ball.ply", "--views", "views.json")
+    ask = (
+        "evaluate",
+        "ball.ply",
+        "ball.sog",
+        "folder",
+        "--teacher",
+        "ball.ply",
+        "--views",
+        "views.json",
+    )
     out, error = succeeds(command_line, folder, *ask, "--json", "-")
     assert " MB " in error
     whole, packed, chunks = (row["file_bytes"] for row in json.loads(out)["scenes"])
-    assert (whole, packed) == tuple((folder / name).stat().st_size for name in ("ball.ply", "ball.sog"))
+    assert (whole, packed) == tuple(
+        (folder / name).stat().st_size for name in ("ball.ply", "ball.sog")
+    )
     assert chunks == sum(file.stat().st_size for file in (folder / "folder").iterdir())
     assert f"{whole / 1e6:.2f}" != f"{packed / 1e6:.2f}"
     assert f"{packed / 1e6:.2f}" in error
@@ -106,7 +119,9 @@ def test_unscaled_images_need_a_network(folder: Path, command_line: CommandLine)
 
 
 @pytest.mark.parametrize("photos", [True, False])
-def test_a_run_is_scored_as_it_was_made(photos: bool, tmp_path: Path, command_line: CommandLine) -> None:
+def test_a_run_is_scored_as_it_was_made(
+    photos: bool, tmp_path: Path, command_line: CommandLine
+) -> None:
     ball = checkered_ball(400)
     io.write_splats(tmp_path / "ball.ply", ball)
     rgba_photos_of(tmp_path / "photos")
@@ -119,7 +134,9 @@ def test_a_run_is_scored_as_it_was_made(photos: bool, tmp_path: Path, command_li
     told = json.loads((tmp_path / "run" / "report.json").read_text())["scores"]["recovered"]
     found = json.loads(out)
     assert found["against"] == ("photos" if photos else "teacher")
-    assert [view["name"] for view in found["scenes"][0]["views"]] == [view["name"] for view in told["views"]]
+    assert [view["name"] for view in found["scenes"][0]["views"]] == [
+        view["name"] for view in told["views"]
+    ]
     assert found["scenes"][0]["psnr"] == pytest.approx(told["psnr"], abs=1e-6)
     if not photos:
         (tmp_path / "ball.ply").unlink()

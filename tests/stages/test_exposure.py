@@ -50,7 +50,9 @@ def photos(gains: Any, offset: Any = 0.0, **more: Any) -> Photos:
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("engine", ["fused", "torch"])
-def test_photos_that_differ_are_matched(kind: str, engine: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_photos_that_differ_are_matched(
+    kind: str, engine: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     if engine == "torch":
         pytest.importorskip("torch")
     targets = photos(KINDS[kind])
@@ -93,7 +95,9 @@ def test_offsets_masks_and_alpha_are_respected() -> None:
     common = np.exp(np.log(gains).mean())
     np.testing.assert_allclose(found[:, 0, 0], gains / common, atol=0.04)
     for view in range(12):
-        image, mask = unexposed(targets, view, np.array([[gains[view], offsets[view]]] * 3), (1, 1, 1))
+        image, mask = unexposed(
+            targets, view, np.array([[gains[view], offsets[view]]] * 3), (1, 1, 1)
+        )
         shown = np.ones(image.shape[:2], bool) if mask is None else mask
         inside = shown & (taken[view][..., :3].min(2) > 0) & (taken[view][..., :3].max(2) < 1)
         np.testing.assert_allclose(image[inside], white.image(VIEWS[view])[inside], atol=0.01)
@@ -180,7 +184,9 @@ def test_exposures_that_explain_little_of_the_error_are_not_fitted() -> None:
     """However much they differ: here each pixel is wrong by far more."""
     scene, rng = BALL.with_sh_degree(0), np.random.default_rng(0)
     images = [
-        np.clip(g2ard.Renderer(scene).clipped(camera) * 0.6 * (0.75 + 0.5 * (row % 2)) + noise, 0, 1)
+        np.clip(
+            g2ard.Renderer(scene).clipped(camera) * 0.6 * (0.75 + 0.5 * (row % 2)) + noise, 0, 1
+        )
         for row, camera in enumerate(VIEWS)
         for noise in [rng.uniform(0, 0.4, (36, 48, 3)).astype(np.float32)]
     ]
@@ -221,7 +227,10 @@ def test_a_target_that_a_device_may_keep_never_changes(monkeypatch: pytest.Monke
         return step(self, view, target, *more, **named)
 
     monkeypatch.setattr(FusedEngine, "step", watched)
-    assert recover(start(), photos(KINDS["exposure"]), RecoverConfig(steps=100)).report.exposure is not None
+    assert (
+        recover(start(), photos(KINDS["exposure"]), RecoverConfig(steps=100)).report.exposure
+        is not None
+    )
     assert not changing[0]
     assert changing[-1]
 

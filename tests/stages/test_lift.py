@@ -102,7 +102,12 @@ def test_non_finite_points_are_left_out():
         (np.zeros((3, 3)), np.zeros((2, 3)), {}, "colors: expected shape"),
         (np.full((3, 3), np.nan), np.zeros((3, 3)), {}, "none of the 3 points is finite"),
         (np.zeros((3, 3)), np.zeros((3, 3)), {"opacity": 1.0}, "opacity: expected"),
-        (np.zeros((3, 3)), np.zeros((3, 3)), {"neighbors": 1}, "neighbors: expected a whole number"),
+        (
+            np.zeros((3, 3)),
+            np.zeros((3, 3)),
+            {"neighbors": 1},
+            "neighbors: expected a whole number",
+        ),
         (np.zeros((3, 3)), np.zeros((3, 3)), {"spread": 0.0}, "spread: expected"),
         (np.zeros((3, 3)), np.zeros((3, 3)), {"max_anisotropy": 0.5}, "max_anisotropy: expected"),
     ],

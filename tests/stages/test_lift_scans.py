@@ -35,9 +35,15 @@ class Tube:
         self.height, self.radius = height, radius
 
     def cast(self, origin, d):
-        a, b, c = (d[..., :2] ** 2).sum(-1), d[..., :2] @ origin[:2], origin[:2] @ origin[:2] - self.radius**2
+        a, b, c = (
+            (d[..., :2] ** 2).sum(-1),
+            d[..., :2] @ origin[:2],
+            origin[:2] @ origin[:2] - self.radius**2,
+        )
         wall = (-b + np.sqrt(b * b - a * c)) / np.maximum(a, 1e-9)
-        floor = np.where(d[..., 2] < 0, (self.height + origin[2]) / np.maximum(-d[..., 2], 1e-9), np.inf)
+        floor = np.where(
+            d[..., 2] < 0, (self.height + origin[2]) / np.maximum(-d[..., 2], 1e-9), np.inf
+        )
         p = origin + d * np.minimum(wall, floor)[..., None]
         out = np.where((wall < floor)[..., None], p * (1, 1, 0), (0, 0, -1.0))
         return p, out / np.linalg.norm(out, axis=-1, keepdims=True)
@@ -59,7 +65,9 @@ class Scan:
 
     def __init__(self, shape, count, turns, lean=0.0, low=-30.0, high=10.0):
         self.shape, self.low, self.high, self.lean = shape, low, high, tilted(lean)
-        up, around = np.meshgrid(np.linspace(low, high, count), np.arange(turns) * 360 / turns, indexing="ij")
+        up, around = np.meshgrid(
+            np.linspace(low, high, count), np.arange(turns) * 360 / turns, indexing="ij"
+        )
         self.points, self.normals = self._hit(directions(up.ravel(), around.ravel()))
 
     def _hit(self, d):
@@ -84,7 +92,11 @@ class Scan:
             ahead = directions(-10, 90 * i + 20) @ self.lean.T
             camera = Camera.facing(origin, origin + ahead, width=SIZE[0], height=SIZE[1])
             v, u = np.mgrid[0 : SIZE[1], 0 : SIZE[0]] + 0.5
-            rays = np.stack([u, v, np.ones_like(u)], -1) @ np.linalg.inv(camera.K).T @ camera.viewmat[:3, :3]
+            rays = (
+                np.stack([u, v, np.ones_like(u)], -1)
+                @ np.linalg.inv(camera.K).T
+                @ camera.viewmat[:3, :3]
+            )
             p = self.shape.cast(origin, rays)[0]
             up = np.degrees(np.arcsin((p @ self.lean)[..., 2] / np.linalg.norm(p, axis=-1)))
             inside = (up > self.low + 2) & (up < self.high - 2)
@@ -141,7 +153,9 @@ def ground(kind):
     elif kind == "lines":
         x, y = (v.ravel() for v in np.meshgrid(np.linspace(-5, 5, 400), np.linspace(-5, 5, 21)))
     else:
-        r, a = (v.ravel() for v in np.meshgrid(np.geomspace(0.8, 6, 14), np.linspace(0, 2 * np.pi, 600)))
+        r, a = (
+            v.ravel() for v in np.meshgrid(np.geomspace(0.8, 6, 14), np.linspace(0, 2 * np.pi, 600))
+        )
         x, y = r * np.cos(a), r * np.sin(a)
     return np.column_stack([x, y, rng.normal(0, 0.005, len(x))])
 
@@ -157,7 +171,8 @@ WIRES = {
     "pair": [wire((-5, y, 4), (5, y, 4), seed=i) for i, y in enumerate((0, 0.5))],
     "one over the other": [wire((-5, 0, z), (5, 0, z), seed=i) for i, z in enumerate((3, 3.4))],
     "bundle": [
-        wire((-5, y, z), (5, y, z), seed=i) for i, (y, z) in enumerate([(0, 4), (0.5, 4), (0.25, 4.4)])
+        wire((-5, y, z), (5, y, z), seed=i)
+        for i, (y, z) in enumerate([(0, 4), (0.5, 4), (0.25, 4.4)])
     ],
     "crossing": [wire((-5, 0, 3), (5, 0, 3)), wire((0, -5, 3.5), (0, 5, 3.5), seed=1)],
 }
@@ -176,14 +191,19 @@ def test_wires_stay_thin(name, kind):
 @pytest.mark.parametrize("gap", [0.2, 0.5, 1.0])
 def test_wires_in_one_plane_are_no_wider_than_their_distance(gap):
     """Several wires of a fence cannot be told from lines on a wall."""
-    fence = np.concatenate([wire((-5, 0, z), (5, 0, z), seed=i) for i, z in enumerate(gap * np.arange(1, 6))])
+    fence = np.concatenate(
+        [wire((-5, 0, z), (5, 0, z), seed=i) for i, z in enumerate(gap * np.arange(1, 6))]
+    )
     got = lift(np.concatenate([ground("random"), fence]), np.full((4000 + len(fence), 3), 0.5))
     assert got.scales[4000:].max() < max(0.6 * gap, 0.15)
 
 
 CLOUDS = {
     "surface": surface(),
-    **{f"{n} lines": lines(n, each)[0] @ turn(n).T for n, each in ((12, 30), (9, 60), (6, 150), (5, 240))},
+    **{
+        f"{n} lines": lines(n, each)[0] @ turn(n).T
+        for n, each in ((12, 30), (9, 60), (6, 150), (5, 240))
+    },
     "wire over points": np.concatenate([ground("random")[::6], *WIRES["along"]]),
     "wires over rings": np.concatenate([ground("rings")[::6], *WIRES["pair"]]),
     "rings in a room": Scan(Box(1.7), 12, 180).points,
@@ -219,7 +239,9 @@ def test_even_points_keep_their_own_discs(kind, noise):
     rng, below = np.random.default_rng(4), ground(kind)
     below[:, 2] = rng.normal(0, noise, len(below))
     got = lift(below, np.full_like(below, 0.5))
-    d2 = ((below[:, None, :2] - below[:400, :2]) ** 2).sum(-1) + (below[:, None, 2] - below[:400, 2]) ** 2
+    d2 = ((below[:, None, :2] - below[:400, :2]) ** 2).sum(-1) + (
+        below[:, None, 2] - below[:400, 2]
+    ) ** 2
     near = below[np.argsort(d2, 0, kind="stable")[:11].T]
     around = near - near.mean(1, keepdims=True)
     values = np.linalg.eigvalsh(np.einsum("nki,nkj->nij", around, around) / 11)

@@ -59,7 +59,8 @@ def photos(targets: TeacherRenders) -> Photos:
 
 @pytest.fixture(scope="module")
 def student() -> Splats:
-    return simplify(TEACHER, 500, method="paper").splats  # leaves recovery more to do than the default
+    # leaves recovery more to do than the default
+    return simplify(TEACHER, 500, method="paper").splats
 
 
 @pytest.fixture
@@ -113,7 +114,9 @@ def test_engines_take_the_same_steps(
 
 
 @pytest.mark.parametrize("engine", ["gpu"], indirect=True)
-def test_the_gpu_recovers_like_the_cpu(student: Splats, targets: TeacherRenders, engine: Any) -> None:
+def test_the_gpu_recovers_like_the_cpu(
+    student: Splats, targets: TeacherRenders, engine: Any
+) -> None:
     config = RecoverConfig(steps=25, regularizers=replace(REGULARIZERS["noisy"], period=10))
     there = recover(student, targets, config)
     assert devices.state().served > 1  # the steps, and images to score
@@ -179,7 +182,9 @@ def test_a_device_may_fail_while_the_result_is_read(
     assert_same_bits(whole.splats, found.splats)
 
 
-def test_same_bits_from_run_to_run_and_for_any_threads(student: Splats, targets: TeacherRenders) -> None:
+def test_same_bits_from_run_to_run_and_for_any_threads(
+    student: Splats, targets: TeacherRenders
+) -> None:
     config = RecoverConfig(steps=25, regularizers=replace(REGULARIZERS["noisy"], period=10))
     first, *others = on_threads(lambda: recover(student, targets, config).splats)
     for other in others:
@@ -194,7 +199,9 @@ def test_same_bits_from_run_to_run_and_for_any_threads(student: Splats, targets:
 def test_an_interrupted_run_resumes_to_the_same_bits(
     student: Splats, photos: Photos, engine: Any, steps: int, weights: Any, tmp_path: Path
 ) -> None:
-    config = RecoverConfig(steps=steps, engine=engine, regularizers=replace(REGULARIZERS["lift"], period=10))
+    config = RecoverConfig(
+        steps=steps, engine=engine, regularizers=replace(REGULARIZERS["lift"], period=10)
+    )
     run = partial(recover, student, photos, config, weights=weights)
     whole = run()
     checkpoint = tmp_path / "c.npz"
@@ -231,12 +238,16 @@ def test_an_interrupt_during_trials_is_kept(
     assert told == [0]
 
 
-def test_resume_refuses_other_options(student: Splats, targets: TeacherRenders, tmp_path: Path) -> None:
+def test_resume_refuses_other_options(
+    student: Splats, targets: TeacherRenders, tmp_path: Path
+) -> None:
     checkpoint = tmp_path / "c.npz"
     config = RecoverConfig(steps=40)
     moved = replace(student, means=student.means + 1)
     with pytest.raises(KeyboardInterrupt):
-        recover(student, targets, config, checkpoint=checkpoint, progress=press_ctrl_c_at("recover", 5))
+        recover(
+            student, targets, config, checkpoint=checkpoint, progress=press_ctrl_c_at("recover", 5)
+        )
     ask = {"student": student, "targets": targets, "config": config, "checkpoint": checkpoint}
     for other in (
         {"config": replace(config, seed=1)},
@@ -263,9 +274,11 @@ def test_trials_choose_rates_that_suit_the_scene(
     good = [t for t in report.trials if t.psnr - report.psnr.before >= 0.96 * most]
     assert report.multiplier == max(trial.multiplier for trial in good)
     assert len(report.trials) >= 2
-    nearly = recover(TEACHER, targets, RecoverConfig(steps=100)).report  # nothing to gain: small steps
+    # nothing to gain: small steps
+    nearly = recover(TEACHER, targets, RecoverConfig(steps=100)).report
     assert nearly.multiplier < 0.34
-    rough = recover(student, targets, RecoverConfig(steps=100)).report  # of renders the error says enough
+    # of renders the error says enough
+    rough = recover(student, targets, RecoverConfig(steps=100)).report
     assert 1 / 3 < rough.multiplier == loop.guess_multiplier(10 ** (-rough.psnr.before / 20))
     assert not rough.trials
     assert nearly.trials
@@ -281,7 +294,9 @@ def test_layers_as_wide_as_the_sky_do_not_shake_the_image() -> None:
         recover(
             start,
             targets,
-            RecoverConfig(schedule=replace(TUNED, multiplier=1.0, reach=reach, momentum=0.9), steps=150),
+            RecoverConfig(
+                schedule=replace(TUNED, multiplier=1.0, reach=reach, momentum=0.9), steps=150
+            ),
         )
         for reach in (None, math.inf)
     )
@@ -301,7 +316,9 @@ def test_gaussians_behind_a_mask_do_not_change(student: Splats, engine: Any) -> 
             return np.tile(np.arange(width) < kept, (height, 1))
 
     views = VIEWS.take(np.arange(2))
-    config = RecoverConfig(steps=12, engine=engine, schedule=replace(TUNED, multiplier=1.0, reach=math.inf))
+    config = RecoverConfig(
+        steps=12, engine=engine, schedule=replace(TUNED, multiplier=1.0, reach=math.inf)
+    )
     after = recover(student, Masked(TEACHER, views), config).splats
     strip = replace(views, widths=np.full_like(views.widths, kept))
     drawn, counted = (visibility(student, v).hits > 0 for v in (views, strip))
@@ -309,7 +326,9 @@ def test_gaussians_behind_a_mask_do_not_change(student: Splats, engine: Any) -> 
     assert alone.sum() > 30
     assert counted.sum() > 30
     for name in ("means", "logit_opacities", "sh0"):
-        moved = (getattr(after, name) != getattr(student, name)).reshape(len(student), -1).any(axis=1)
+        moved = (
+            (getattr(after, name) != getattr(student, name)).reshape(len(student), -1).any(axis=1)
+        )
         assert not moved[alone].any(), name
         assert moved[counted].mean() > 0.5, name
 
@@ -333,7 +352,9 @@ def test_a_recovery_time_sets_the_horizon(student: Splats, targets: TeacherRende
 
 
 @pytest.mark.usefixtures("clock")
-def test_a_recovery_that_time_ends_says_what_it_missed(student: Splats, targets: TeacherRenders) -> None:
+def test_a_recovery_that_time_ends_says_what_it_missed(
+    student: Splats, targets: TeacherRenders
+) -> None:
     seen: dict[int, tuple[float, Splats]] = {}
     config = RecoverConfig(recovery_time=6.0)
 
@@ -345,10 +366,15 @@ def test_a_recovery_that_time_ends_says_what_it_missed(student: Splats, targets:
     assert done.steps < planned == done.planned
     looked = 1 + min(step for step, (seconds, _) in seen.items() if seconds >= 0.75 * 6.0)
     before, after = (
-        probe.Probe(targets, config.background).score(seen[step][1]) for step in (looked, done.steps)
+        probe.Probe(targets, config.background).score(seen[step][1])
+        for step in (looked, done.steps)
     )
     assert done.pace == pytest.approx(100 * (after - before) / (done.steps - looked))
-    gaining = f"it was still gaining {done.pace:.1f} dB" if done.pace >= 0.05 else "it gained under 0.05 dB"
+    gaining = (
+        f"it was still gaining {done.pace:.1f} dB"
+        if done.pace >= 0.05
+        else "it gained under 0.05 dB"
+    )
     told = f"time ended recovery at step {done.steps} of {planned:,}; {gaining} per 100 steps"
     assert describe_time_limit(done) == told
     long_enough = replace(config, schedule=replace(TUNED, steps=20))
@@ -357,7 +383,9 @@ def test_a_recovery_that_time_ends_says_what_it_missed(student: Splats, targets:
     assert (unlimited.planned, unlimited.pace) == (None, None)
 
 
-def test_progress_figures(student: Splats, targets: TeacherRenders, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_progress_figures(
+    student: Splats, targets: TeacherRenders, monkeypatch: pytest.MonkeyPatch
+) -> None:
     for share in ("_SCORING_TIME_SHARE", "_FIRST_SCORING_SHARE"):
         monkeypatch.setattr(probe, share, 1e9)  # after every step, however long one takes
     seen: list[Any] = []
@@ -408,7 +436,9 @@ def test_steps_that_lose_are_undone_and_made_smaller(targets: TeacherRenders) ->
     assert told.startswith(f"recovery fell to {done.backed_off[0].psnr:.2f} dB (start ")
 
 
-def test_a_resume_after_undone_steps_gives_the_same_bits(targets: TeacherRenders, tmp_path: Path) -> None:
+def test_a_resume_after_undone_steps_gives_the_same_bits(
+    targets: TeacherRenders, tmp_path: Path
+) -> None:
     start = simplify(TEACHER, 1500).splats
     config = RecoverConfig(schedule=replace(WILD, multiplier=6.0), steps=60)
     whole = recover(start, targets, config)
@@ -416,7 +446,13 @@ def test_a_resume_after_undone_steps_gives_the_same_bits(targets: TeacherRenders
     for step in (9, 35, 58):
         checkpoint = tmp_path / f"{step}.npz"
         with pytest.raises(KeyboardInterrupt):
-            recover(start, targets, config, checkpoint=checkpoint, progress=press_ctrl_c_at("recover", step))
+            recover(
+                start,
+                targets,
+                config,
+                checkpoint=checkpoint,
+                progress=press_ctrl_c_at("recover", step),
+            )
         resumed = recover(start, targets, config, checkpoint=checkpoint)
         assert_same_bits(whole.splats, resumed.splats)
         for key in ("backed_off", "multiplier", "psnr", "stopped", "blend"):
@@ -479,7 +515,9 @@ def test_validation_views_scale_back_harmful_changes() -> None:
     assert gaining.choose_by_validation(end, views, 9) == (end, 0.0)
     harm = guard(10.0, lambda scene: -float(way(scene).mean()))
     assert harm.choose_by_validation(end, views, 9) == (start, math.inf)
-    half = guard(10.0, lambda scene: -abs(float(way(scene)[0]) - 0.25) - abs(float(way(scene)[3]) - 0.25))
+    half = guard(
+        10.0, lambda scene: -abs(float(way(scene)[0]) - 0.25) - abs(float(way(scene)[3]) - 0.25)
+    )
     part, k = half.choose_by_validation(end, views, 9)
     assert k is None
     np.testing.assert_allclose(way(part), 0.25, atol=1e-5)
@@ -506,7 +544,8 @@ def test_training_views_vote_on_which_changes_were_harmful() -> None:
         total = np.zeros((2, len(start)))
         for camera, target in zip(targets.cameras, targets, strict=True):
             old, new = (
-                (Renderer(scene).clipped(camera).astype(np.float64) - target) ** 2 for scene in (start, end)
+                (Renderer(scene).clipped(camera).astype(np.float64) - target) ** 2
+                for scene in (start, end)
             )
             change = (new - old).mean(axis=2) / (old.mean() * len(target) * target.shape[1])
             for row in range(len(start)):
@@ -542,24 +581,30 @@ def test_a_recovery_that_only_harms_validation_views_stops_at_half(targets: Teac
     assert told.startswith("kept the start: every step made validation views worse (")
 
 
-def test_other_views_gain_where_training_views_can_spare_it(student: Splats, tmp_path: Path) -> None:
+def test_other_views_gain_where_training_views_can_spare_it(
+    student: Splats, tmp_path: Path
+) -> None:
     cap = around(40).take(np.arange(8))  # from above alone
     kinds = ("near",) * 3 + ("anywhere",) * 3
     targets, near = (
-        TeacherRenders(TEACHER, views) for views in (cap, replace(around(6, (64, 48), 2.0), kinds=kinds))
+        TeacherRenders(TEACHER, views)
+        for views in (cap, replace(around(6, (64, 48), 2.0), kinds=kinds))
     )
     config = RecoverConfig(steps=100)
     plain = recover(student, targets, config)
     held = recover(student, targets, config, validation=near)
     assert plain.report.validation is None
     gains = [
-        evaluate(held.splats, views).psnr - evaluate(plain.splats, views).psnr for views in (targets, near)
+        evaluate(held.splats, views).psnr - evaluate(plain.splats, views).psnr
+        for views in (targets, near)
     ]
     assert gains[0] > -0.3
     assert gains[1] >= -min(0.0, gains[0])
     last = held.report.validation.looks[-1].psnr
     of = {kind: Subset(near, [row for row in range(6) if kinds[row] == kind]) for kind in kinds}
-    assert last == {k: pytest.approx(evaluate(held.splats, views).psnr, abs=1e-3) for k, views in of.items()}
+    assert last == {
+        k: pytest.approx(evaluate(held.splats, views).psnr, abs=1e-3) for k, views in of.items()
+    }
     checkpoint = tmp_path / "c.npz"
     stop = press_ctrl_c_at("recover", 60)
     with pytest.raises(KeyboardInterrupt):
@@ -580,12 +625,16 @@ def test_the_guard_goes_by_the_kind_of_view_that_loses_most() -> None:
 
     def guard(near: float, anywhere: float) -> Guard:
         def others(scene: Splats) -> dict[str, float]:
-            return {"near": 30 + near * way(scene), "anywhere": 20 - anywhere * (way(scene) - 0.25) ** 2}
+            return {
+                "near": 30 + near * way(scene),
+                "anywhere": 20 - anywhere * (way(scene) - 0.25) ** 2,
+            }
 
         return Guard(lambda scene: way(scene), start, 0.0, others)
 
     seen = np.full(4, 2.0)
-    part, k = guard(5, 16).choose_by_validation(end, seen, 9)  # loses 8 dB at the end, nothing halfway
+    # loses 8 dB at the end, nothing halfway
+    part, k = guard(5, 16).choose_by_validation(end, seen, 9)
     assert (k, way(part)) == (2.0, pytest.approx(0.5, abs=1e-5))
     part, k = guard(99, 16).choose_by_validation(end, seen, 9)  # the mean gains, but a kind loses
     assert (k, way(part)) == (None, pytest.approx(0.25, abs=1e-5))
@@ -597,7 +646,12 @@ def test_the_guard_goes_by_the_kind_of_view_that_loses_most() -> None:
 
 
 def test_invalid_options_are_named() -> None:
-    for wrong in ({"steps": 0}, {"recovery_time": 0.0}, {"recovery_time": math.nan}, {"ssim_weight": 2.0}):
+    for wrong in (
+        {"steps": 0},
+        {"recovery_time": 0.0},
+        {"recovery_time": math.nan},
+        {"ssim_weight": 2.0},
+    ):
         with pytest.raises(InputError, match=next(iter(wrong))):
             RecoverConfig(**wrong)  # type: ignore[arg-type]
 
@@ -628,7 +682,9 @@ def test_after_the_score_changes_the_best_scene_is_scored_anew() -> None:
 
 
 @pytest.mark.parametrize("known", [False, True])
-def test_exposures_that_are_found_change_all_scores(known: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_exposures_that_are_found_change_all_scores(
+    known: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Weights that are known from the start change nothing."""
     told: list[str] = []
     running = SimpleNamespace(
@@ -657,7 +713,8 @@ def test_hardly_better_is_not_worth_to_take_changes_back() -> None:
     for worth, chosen in ((0.08, 0.0), (0.8, 2.0)):
 
         def others(scene: Splats, worth: float = worth) -> dict[str, float]:
-            return {"near": 5.0 - worth * abs(way(scene) - 0.5)}  # best at half of the way, which k = 2 goes
+            # best at half of the way, which k = 2 goes
+            return {"near": 5.0 - worth * abs(way(scene) - 0.5)}
 
         guard = Guard(lambda scene: 10 * min(way(scene), 0.5), start, 0.0, others)
         assert guard.choose_by_validation(end, views, 9)[1] == chosen
@@ -666,6 +723,8 @@ def test_hardly_better_is_not_worth_to_take_changes_back() -> None:
 @pytest.mark.parametrize(("loss", "decision"), [(0.4, "on"), (0.6, "stop")])
 def test_validation_stops_runs_that_lose_half_a_decibel(loss: float, decision: str) -> None:
     start, later = checkered_ball(2), checkered_ball(3)
-    guard = Guard(lambda scene: 1.0, start, 0.0, lambda scene: {"near": 9.0 - loss * (scene is later)})
+    guard = Guard(
+        lambda scene: 1.0, start, 0.0, lambda scene: {"near": 9.0 - loss * (scene is later)}
+    )
     assert guard.look(later, 0.5, 40) == decision
     assert guard.stopped == (40 if decision == "stop" else None)

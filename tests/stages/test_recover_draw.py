@@ -49,7 +49,9 @@ def test_every_epoch_draws_within_one_of_the_weights(raw: list[float], epoch: in
 
 def test_many_epochs_draw_views_by_weight() -> None:
     weights = check_weights(np.random.default_rng(0).random(20) ** 3, 20)
-    counts = sum(np.bincount(draw_views(1, epoch, 20, weights), minlength=20) for epoch in range(400))
+    counts = sum(
+        np.bincount(draw_views(1, epoch, 20, weights), minlength=20) for epoch in range(400)
+    )
     np.testing.assert_allclose(counts / 400, weights, atol=0.08)
 
 
@@ -62,7 +64,12 @@ def test_equal_weights_draw_like_no_weights(value: float) -> None:
 
 @pytest.mark.parametrize(
     ("weights", "words"),
-    [([1.0] * 3, "expected 16"), ([-1.0] * 16, "view 0"), ([np.nan] * 16, "view 0"), ([0.0] * 16, "zero")],
+    [
+        ([1.0] * 3, "expected 16"),
+        ([-1.0] * 16, "view 0"),
+        ([np.nan] * 16, "view 0"),
+        ([0.0] * 16, "zero"),
+    ],
 )
 def test_invalid_weights_are_rejected(
     student: Splats, targets: TeacherRenders, weights: list[float], words: str
@@ -78,24 +85,42 @@ def test_the_command_scores_held_out_views_by_kind(
     write_splats(tmp_path / "student.ply", student)
     views = replace(around(8), kinds=tuple("anywhere" if i % 4 else "usual" for i in range(8)))
     write_views(tmp_path / "views.json", views, splits=("train", "test") * 4)
-    ask = ("recover", "student.ply", "--views", "views.json", "--teacher", "teacher.ply", "--steps", 20)
+    ask = (
+        "recover",
+        "student.ply",
+        "--views",
+        "views.json",
+        "--teacher",
+        "teacher.ply",
+        "--steps",
+        20,
+    )
     ask = (*ask, "-o", "out.ply", "--json", "-")
     (kind,) = json.loads(succeeds(command_line, tmp_path, *ask).out)["kinds"]
     held_out = TeacherRenders(TEACHER, views.take([1, 3, 5, 7]))
     assert (kind["kind"], kind["views"]) == ("anywhere", 4)
     recovered = evaluate(read_splats(tmp_path / "out.ply"), held_out)
     assert kind["psnr"]["after"] == pytest.approx(recovered.psnr, abs=1e-3)
-    assert json.loads(succeeds(command_line, tmp_path, *ask, "--split", "all", "-w").out)["kinds"] == []
+    assert (
+        json.loads(succeeds(command_line, tmp_path, *ask, "--split", "all", "-w").out)["kinds"]
+        == []
+    )
 
 
-def test_the_command_draws_by_weights_of_views(student: Splats, tmp_path: Path, command_line: Any) -> None:
+def test_the_command_draws_by_weights_of_views(
+    student: Splats, tmp_path: Path, command_line: Any
+) -> None:
     write_splats(tmp_path / "teacher.ply", TEACHER)
     write_splats(tmp_path / "student.ply", student)
     write_views(tmp_path / "plain.json", VIEWS)
     write_views(tmp_path / "weighted.json", VIEWS, weights=WEIGHTS)
     made = {}
     ask = ("recover", "student.ply", "--teacher", "teacher.ply", "--split", "all", "--steps", 20)
-    for name, *views in (("even", "plain"), ("drawn", "weighted"), ("ignored", "weighted", "--no-weights")):
+    for name, *views in (
+        ("even", "plain"),
+        ("drawn", "weighted"),
+        ("ignored", "weighted", "--no-weights"),
+    ):
         views[0] = f"--views={views[0]}.json"
         error = succeeds(command_line, tmp_path, *ask, *views, "-o", f"{name}.ply").err
         assert ("views by weight" in error) == (name == "drawn")

@@ -103,10 +103,14 @@ def naive_losses(
 
 def moved(splats: Splats, seed: int = 1) -> list[torch.Tensor]:
     rng = np.random.default_rng(seed)
-    means = splats.means + rng.normal(size=splats.means.shape) * splats.scales.max(1, keepdims=True) * 2
+    means = (
+        splats.means + rng.normal(size=splats.means.shape) * splats.scales.max(1, keepdims=True) * 2
+    )
     log_scales = splats.log_scales + rng.normal(size=splats.scales.shape)
     quats = splats.quats + 0.3 * rng.normal(size=splats.quats.shape)
-    return [torch.tensor(a, dtype=torch.float64, requires_grad=True) for a in (means, log_scales, quats)]
+    return [
+        torch.tensor(a, dtype=torch.float64, requires_grad=True) for a in (means, log_scales, quats)
+    ]
 
 
 def test_regularisers_equal_their_naive_twins() -> None:
@@ -118,7 +122,9 @@ def test_regularisers_equal_their_naive_twins() -> None:
     assert shape_loss(
         log_scales, quats, anchors, Regularizers(0.5, 0.25, effective_rank=True)
     ).item() == pytest.approx(shape, rel=1e-4)
-    both = regularization(means, quats, log_scales, anchors, Regularizers(0.5, 0.25, effective_rank=True))
+    both = regularization(
+        means, quats, log_scales, anchors, Regularizers(0.5, 0.25, effective_rank=True)
+    )
     assert both.item() == pytest.approx(0.5 * anchor + 0.25 * shape, rel=1e-4)
 
 
@@ -133,9 +139,13 @@ def test_auto_preset_tells_lift_trained_and_noisy_apart() -> None:
     trained = random_splats()
     lift = Splats.create(trained.means, scales=np.tile([1.0, 1.0, 0.1], (40, 1)))
     noisy = Splats.create(
-        trained.means, scales=np.tile([1.0, 1e-3, 1e-3], (40, 1)), logit_opacities=trained.logit_opacities
+        trained.means,
+        scales=np.tile([1.0, 1e-3, 1e-3], (40, 1)),
+        logit_opacities=trained.logit_opacities,
     )
-    round_ = Splats.create(trained.means, scales=np.ones((40, 3)), logit_opacities=trained.logit_opacities)
+    round_ = Splats.create(
+        trained.means, scales=np.ones((40, 3)), logit_opacities=trained.logit_opacities
+    )
     assert choose_regularizers("auto", lift)[0] == REGULARIZERS["lift"]
     assert choose_regularizers("auto", noisy)[0] == REGULARIZERS["noisy"]
     assert choose_regularizers("auto", round_)[0] == REGULARIZERS["trained"]
@@ -172,8 +182,12 @@ def test_views_that_see_through_each_other_s_surfaces_make_a_prior_noisy() -> No
     assert measure_view_consistency(ball, views.take([0])) is None
 
 
-@pytest.mark.parametrize(("ratio", "agree"), [(1, 1), (1.04, 1), (1.06, 0), (1.3, 0), (0.96, 1), (0.94, 0)])
-def test_depths_agree_within_a_twentieth(ratio: float, agree: int, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ("ratio", "agree"), [(1, 1), (1.04, 1), (1.06, 0), (1.3, 0), (0.96, 1), (0.94, 0)]
+)
+def test_depths_agree_within_a_twentieth(
+    ratio: float, agree: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Two views from one place, one of which sees everything `ratio` times as far."""
     views = around(2, (32, 24))
     views = replace(views, viewmats=views.viewmats[[0, 0]])
@@ -197,7 +211,9 @@ def test_a_scaled_schedule_keeps_its_proportions() -> None:
 
 
 @torch.no_grad()
-def _step_in_torch(adam: SelectiveAdam, rates: dict[str, float], shares: dict[str, torch.Tensor]) -> None:
+def _step_in_torch(
+    adam: SelectiveAdam, rates: dict[str, float], shares: dict[str, torch.Tensor]
+) -> None:
     """Take the kernel's step with torch's operations."""
     parameters, moments = adam._parameters, adam.moments
     grads = {name: p.grad for name, p in parameters.items()}

@@ -22,7 +22,14 @@ from g2ard.system import devices
 from helpers.gpus import skip_without_gpu
 from helpers.raster_cases import NAMES, Params, camera, scene, splats_of, tensors_of
 
-RATES = {"means": 2e-3, "quats": 1e-2, "log_scales": 2e-2, "logit_opacities": 5e-2, "sh0": 2e-2, "shN": 2e-3}
+RATES = {
+    "means": 2e-3,
+    "quats": 1e-2,
+    "log_scales": 2e-2,
+    "logit_opacities": 5e-2,
+    "sh0": 2e-2,
+    "shN": 2e-3,
+}
 BACKGROUND = (0.1, 0.2, 0.3)
 SETTINGS = RasterSettings(antialiased=False)
 
@@ -68,7 +75,9 @@ def step(
     return trainer.step(view, target, rates, regularizers)
 
 
-def problem(n: int = 200, degree: int = 3, views: int = 3) -> tuple[Params, list[Cameras], list[Any]]:
+def problem(
+    n: int = 200, degree: int = 3, views: int = 3
+) -> tuple[Params, list[Cameras], list[Any]]:
     rng = np.random.default_rng(1)
     p = scene(7, n, degree, size=0.15, spread=0.5)
     cameras = [camera(56, 40, seed=s) for s in range(views)]
@@ -129,7 +138,11 @@ class Twin:
         loss = l1_ssim(image, torch.from_numpy(target), 0.2)
         total = loss if extra is None else loss + extra(dict(zip(NAMES, mine, strict=True)))
         total.backward()
-        grads = {k: m.grad.double().numpy() for k, m in zip(NAMES, mine, strict=True) if m.grad is not None}
+        grads = {
+            k: m.grad.double().numpy()
+            for k, m in zip(NAMES, mine, strict=True)
+            if m.grad is not None
+        }
         rows = np.zeros(len(self.t), bool)
         for g in grads.values():
             rows |= (g.reshape(len(g), -1) != 0).any(1) if g.size else False
@@ -142,7 +155,9 @@ class Twin:
             m, v = self.m[k] / (1 - momentum**t), self.v[k] / (1 - 0.999**t)
             unit = self.units.reshape(r.shape) if k == "means" else 1.0
             unit = unit * shares.get(k, 1.0)
-            self.p[k] = np.where(r, self.p[k] - RATES[k] * unit * m / (np.sqrt(v) + 1e-15), self.p[k])
+            self.p[k] = np.where(
+                r, self.p[k] - RATES[k] * unit * m / (np.sqrt(v) + 1e-15), self.p[k]
+            )
         return loss.item()
 
 
@@ -154,7 +169,9 @@ def assert_close(
             continue
         moved = np.linalg.norm(want[name] - start[name])
         # Adam turns a gradient lost in rounding into a full step: a few rows may differ, most may not.
-        close = np.abs(a - want[name]) <= to * np.maximum(np.abs(want[name] - start[name]), RATES[name])
+        close = np.abs(a - want[name]) <= to * np.maximum(
+            np.abs(want[name] - start[name]), RATES[name]
+        )
         assert close.mean() > 0.99, f"{name}: {1 - close.mean():.4f} of the values differ"
         assert np.linalg.norm(a - want[name]) < 0.1 * moved, name
 
@@ -209,11 +226,15 @@ def test_sizes_on_the_screen_are_the_naive_ones() -> None:
     tensors = [torch.from_numpy(p[k].astype(np.float64)) for k in ("means", "quats", "log_scales")]
     largest, axes = measure_extents(*tensors, cameras[0], 0, SETTINGS.near_of(0))
     want = naive_shares(p, cameras[0], 3.0)
-    np.testing.assert_allclose(share_of_rate(largest, 3.0)[:, None], want["means"], rtol=1e-4, atol=1e-12)
+    np.testing.assert_allclose(
+        share_of_rate(largest, 3.0)[:, None], want["means"], rtol=1e-4, atol=1e-12
+    )
     np.testing.assert_allclose(share_of_rate(axes, 3.0), want["log_scales"], rtol=1e-4, atol=1e-12)
     want, ahead = naive_shares(p, cameras[0], 3.0, 1.0), largest > 0
     found = share_of_rate(axes, 3.0, 1.0)
-    np.testing.assert_allclose(found[ahead], want["log_scales"][ahead.numpy()], rtol=1e-4, atol=1e-12)
+    np.testing.assert_allclose(
+        found[ahead], want["log_scales"][ahead.numpy()], rtol=1e-4, atol=1e-12
+    )
 
 
 @on_both
@@ -234,9 +255,13 @@ def test_relative_steps_descend_the_logarithm_of_the_loss(on: str) -> None:
     p, (view, *_), (target, *_) = problem()
     plain, relative = trainer_of(p, on=on), trainer_of(p, on=on)
     loss, _ = plain.step(view_of(view, 0, SETTINGS), target, Rates(**RATES))
-    assert relative.step(view_of(view, 0, SETTINGS), target, Rates(**RATES), relative=0.02)[0] == loss
+    assert (
+        relative.step(view_of(view, 0, SETTINGS), target, Rates(**RATES), relative=0.02)[0] == loss
+    )
     want = plain.state()["first"] * np.float32(0.02 / loss)
-    np.testing.assert_allclose(relative.state()["first"], want, rtol=1e-3, atol=1e-3 * np.abs(want).max())
+    np.testing.assert_allclose(
+        relative.state()["first"], want, rtol=1e-3, atol=1e-3 * np.abs(want).max()
+    )
 
 
 @pytest.mark.parametrize(
@@ -265,14 +290,20 @@ def test_regularizers_are_torch_s(weights: Regularizers, on: str) -> None:
         return regularization(q["means"], q["quats"], q["log_scales"], anchors, weights)
 
     trainer, twin = trainer_of(p, on=on), Twin(p)
-    trainer.anchor(anchors.means, np.ascontiguousarray(anchors.frames), anchors.r_parallel, anchors.r_perp)
+    trainer.anchor(
+        anchors.means, np.ascontiguousarray(anchors.frames), anchors.r_parallel, anchors.r_perp
+    )
     for i in range(3):
         step(trainer, cameras[i], targets[i], weights)
         twin.step(cameras[i], targets[i], extra)
     assert_close(trainer.arrays(), twin.p, p, to=3e-2)
     # The moments hold the gradients themselves: they show the scale that Adam's steps hide.
     first = trainer.state()["first"].reshape(100, -1)
-    for name, columns in (("means", slice(0, 3)), ("quats", slice(3, 7)), ("log_scales", slice(7, 10))):
+    for name, columns in (
+        ("means", slice(0, 3)),
+        ("quats", slice(3, 7)),
+        ("log_scales", slice(7, 10)),
+    ):
         error = np.linalg.norm(first[:, columns] - twin.m[name]) / np.linalg.norm(twin.m[name])
         assert error < 2e-3, f"{name}: {error}"
 

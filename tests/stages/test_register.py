@@ -36,7 +36,9 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "photos").mkdir()
     lines = ["# name qw qx qy qz tx ty tz error"]
     for i, view in enumerate(views):
-        write_png(folder / f"photos/{view.name}.png", np.clip(0.8 * renderer.image(view) + 0.05, 0, 1))
+        write_png(
+            folder / f"photos/{view.name}.png", np.clip(0.8 * renderer.image(view) + 0.05, 0, 1)
+        )
         pose = off(view.viewmat, 0.08, 2, i)
         w, x, y, z = quaternion(pose[:3, :3])
         lines.append(" ".join(map(str, (f"{view.name}.png", w, x, y, z, *pose[:3, 3], 0.1))))
@@ -44,14 +46,18 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     paths = tuple(folder / f"photos/{name}.png" for name in views.names)
     views = Cameras.of([Cameras.of([v])[0] for v in views])
     write_views(folder / "truth.json", views)
-    write_views(folder / "views.json", replace(views, names=tuple(p.name for p in paths), image_paths=paths))
+    write_views(
+        folder / "views.json", replace(views, names=tuple(p.name for p in paths), image_paths=paths)
+    )
     return folder
 
 
 def test_poses_as_text_are_camera_from_world(site: Path) -> None:
     found, truth = read_ace(site / "coarse.txt"), read_poses(site / "truth.json")
     for i, (name, pose) in enumerate(found.items()):
-        np.testing.assert_allclose(pose, off(truth[name.removesuffix(".png")], 0.08, 2, i), atol=1e-12)
+        np.testing.assert_allclose(
+            pose, off(truth[name.removesuffix(".png")], 0.08, 2, i), atol=1e-12
+        )
 
 
 @pytest.mark.parametrize(
@@ -122,7 +128,16 @@ def test_a_pool_gives_starts_by_rank(site: Path) -> None:
 
 
 def test_the_command_writes_views(site: Path, command_line: CommandLine, tmp_path: Path) -> None:
-    common = ("--images", site / "photos", "--intrinsics", site / "truth.json", "--size", 128, "--json", "-")
+    common = (
+        "--images",
+        site / "photos",
+        "--intrinsics",
+        site / "truth.json",
+        "--size",
+        128,
+        "--json",
+        "-",
+    )
     common = (*common, "--report", "page.html", "--set", "register.coarsest=32", "-o", "poses.json")
     arguments = ("register", site / "scene.ply", *common, "--poses", site / "coarse.txt")
     arguments = (*arguments, "--truth", site / "truth.json")
@@ -143,7 +158,9 @@ def test_the_command_writes_views(site: Path, command_line: CommandLine, tmp_pat
         assert pose_error(view.viewmat, truth[view.name.removesuffix(".png")])[0] < 0.005
         assert view.image_path.is_file()
     again = command_line(*arguments, "-w", "--threads", "1", cwd=tmp_path)[1]
-    poses = [[row["camera_from_world"] for row in json.loads(text)["photos"]] for text in (out, again)]
+    poses = [
+        [row["camera_from_world"] for row in json.loads(text)["photos"]] for text in (out, again)
+    ]
     assert poses[0] == poses[1]
 
 
@@ -218,16 +235,36 @@ def test_the_focal_length_of_exif(tmp_path: Path) -> None:
     assert photos_of(photos, focal=100).Ks[0, 0, 0] == 100
 
 
-def test_photos_to_poses_to_an_adapted_scene(site: Path, command_line: CommandLine, tmp_path: Path) -> None:
+def test_photos_to_poses_to_an_adapted_scene(
+    site: Path, command_line: CommandLine, tmp_path: Path
+) -> None:
     """`adapt` and `recover` read the output of `register`, and the scene takes on the photos' light."""
     from g2ard.rendering.targets import Photos
 
     photos = ("--images", site / "photos", "--intrinsics", site / "views.json", "--size", "128")
-    ask = ("register", site / "scene.ply", *photos, "--poses", site / "coarse.txt", "-o", "poses.json")
+    ask = (
+        "register",
+        site / "scene.ply",
+        *photos,
+        "--poses",
+        site / "coarse.txt",
+        "-o",
+        "poses.json",
+    )
     succeeds(command_line, tmp_path, *ask)
     views = ("--views", "poses.json", "--split", "all")
     for command, output in (("adapt", "adapted.ply"), ("recover", "recovered.ply")):
-        succeeds(command_line, tmp_path, command, site / "scene.ply", *views, "--steps", "40", "-o", output)
+        succeeds(
+            command_line,
+            tmp_path,
+            command,
+            site / "scene.ply",
+            *views,
+            "--steps",
+            "40",
+            "-o",
+            output,
+        )
     targets = Photos(read_views(site / "views.json"))
     before, after = (
         g2ard.evaluate(g2ard.load(path), targets).psnr
@@ -245,7 +282,9 @@ def test_keep_all_writes_the_start_of_photos_without_a_pose(site: Path) -> None:
     found = register(scene, photos, starts=starts, config=none, keep="all")
     assert found.report.count("refused") == 4
     assert "fewer than 10000 matches" in str(found.report.photos[0].reason)
-    np.testing.assert_array_equal(found.cameras.viewmats, np.stack([starts[n] for n in photos.names]))
+    np.testing.assert_array_equal(
+        found.cameras.viewmats, np.stack([starts[n] for n in photos.names])
+    )
     assert all(row.camera_from_world for row in found.report.photos)
 
 
@@ -253,10 +292,29 @@ def test_one_pass_of_features_without_refinement(
     site: Path, command_line: CommandLine, tmp_path: Path
 ) -> None:
     pytest.importorskip("pycolmap")
-    arguments = ("--images", site / "views.json", "--size", "128", "--passes", "1", "--refine", "none")
+    arguments = (
+        "--images",
+        site / "views.json",
+        "--size",
+        "128",
+        "--passes",
+        "1",
+        "--refine",
+        "none",
+    )
     arguments = (*arguments, "--keep", "all", "--set", "register.fallback=false")
-    arguments = (*arguments, "--poses", site / "coarse.txt", "--report", "page.html", "-o", "poses.json")
-    out = succeeds(command_line, tmp_path, "register", site / "scene.ply", *arguments, "--json", "-").out
+    arguments = (
+        *arguments,
+        "--poses",
+        site / "coarse.txt",
+        "--report",
+        "page.html",
+        "-o",
+        "poses.json",
+    )
+    out = succeeds(
+        command_line, tmp_path, "register", site / "scene.ply", *arguments, "--json", "-"
+    ).out
     rows = json.loads(out)["photos"]
     assert all(row["passes"] <= 1 and row["camera_from_world"] for row in rows)
     assert len(read_views(tmp_path / "poses.json")) == 4
@@ -265,9 +323,22 @@ def test_one_pass_of_features_without_refinement(
     )
 
 
-def test_python_registers_as_the_command_does(site: Path, command_line: CommandLine, tmp_path: Path) -> None:
+def test_python_registers_as_the_command_does(
+    site: Path, command_line: CommandLine, tmp_path: Path
+) -> None:
     scene, photos, poses = (site / name for name in ("scene.ply", "views.json", "coarse.txt"))
-    ask = ("--images", photos, "--poses", poses, "--size", 96, "--matcher", "direct", "-o", "a.json")
+    ask = (
+        "--images",
+        photos,
+        "--poses",
+        poses,
+        "--size",
+        96,
+        "--matcher",
+        "direct",
+        "-o",
+        "a.json",
+    )
     out = succeeds(command_line, tmp_path, "register", scene, *ask, "--json", "-")
     found = g2ard.register(scene, photos, poses=poses, settings={"size": 96, "matcher": "direct"})
     poses = [row["camera_from_world"] for row in json.loads(out.out)["photos"]]

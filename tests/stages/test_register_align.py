@@ -47,7 +47,9 @@ def test_errors_of_poses_are_exact_when_small() -> None:
 def test_normal_equations_are_the_twins(seed: int, masked: bool) -> None:
     rng = np.random.default_rng(seed)
     shape = int(rng.integers(5, 14)), int(rng.integers(5, 14))
-    K = np.array([[rng.uniform(5, 30), 0, shape[1] / 2], [0, rng.uniform(5, 30), shape[0] / 2], [0, 0, 1]])
+    K = np.array(
+        [[rng.uniform(5, 30), 0, shape[1] / 2], [0, rng.uniform(5, 30), shape[0] / 2], [0, 0, 1]]
+    )
     photo = level_of(rng.random(shape), rng.random(shape) < 0.8 if masked else None)
     shot = Shot(rng.random(shape), rng.uniform(0.5, 9, shape), rng.random(shape) < 0.9)
     gain, bias = rng.uniform(0.5, 2), rng.normal(0, 0.1)
@@ -115,7 +117,9 @@ def test_predicts_how_renders_change() -> None:
             inner &= np.roll(shot.mask, shift, axis)
     for axis, step in enumerate([0.006] * 6):
         ahead, behind = (
-            shot_of(renderer.render(replace(camera, viewmat=moved(camera.viewmat, xi))), CONFIG).grey
+            shot_of(
+                renderer.render(replace(camera, viewmat=moved(camera.viewmat, xi))), CONFIG
+            ).grey
             for xi in (step * np.eye(6)[axis], -step * np.eye(6)[axis])
         )
         measured = ((ahead - behind) / (2 * step))[inner]
@@ -131,7 +135,9 @@ def test_known_errors_are_taken_back(view: int) -> None:
     camera = around(5, (160, 120), 2.5)[view]
     renderer = Renderer(BALL)
     photo = np.clip(0.7 * renderer.image(camera) + 0.1, 0, 1)
-    found = align(renderer, off(camera.viewmat, 0.15, 4, view), pyramid_of(camera, photo, CONFIG), CONFIG)
+    found = align(
+        renderer, off(camera.viewmat, 0.15, 4, view), pyramid_of(camera, photo, CONFIG), CONFIG
+    )
     distance, angle = pose_error(found.viewmat, camera.viewmat)
     assert distance < 1e-3
     assert angle < 0.03
@@ -170,9 +176,17 @@ def test_a_shift_is_that_of_the_best_correlation_without_wrapping(shape: tuple[i
         found = {}
         for down in range(-(shape[0] // 2), shape[0] // 2 + 1):
             for right in range(-(shape[1] // 2), shape[1] // 2 + 1):
-                there = [slice(max(0, s), n + min(0, s)) for s, n in zip((down, right), shape, strict=True)]
-                here = [slice(max(0, -s), n + min(0, -s)) for s, n in zip((down, right), shape, strict=True)]
-                found[right, down] = (a[*here] * b[*there]).sum() / np.sqrt((a * a).sum() * (b * b).sum())
+                there = [
+                    slice(max(0, s), n + min(0, s))
+                    for s, n in zip((down, right), shape, strict=True)
+                ]
+                here = [
+                    slice(max(0, -s), n + min(0, -s))
+                    for s, n in zip((down, right), shape, strict=True)
+                ]
+                found[right, down] = (a[*here] * b[*there]).sum() / np.sqrt(
+                    (a * a).sum() * (b * b).sum()
+                )
         best = max(found, key=lambda shift: found[shift])
         right, down, score = shift_between(a, b)
         assert (right, down) == best
@@ -191,7 +205,8 @@ def test_features_and_light_are_joined_like_their_measurements(seed: int) -> Non
     rng = np.random.default_rng(seed)
     of_features, of_light, focal_sigma = _informed(rng), _informed(rng), 0.5
     prior = np.zeros((7, 7))
-    prior[6, 6] = focal_sigma**-2  # of the logarithm of the focal length over the given one, about 0
+    # of the logarithm of the focal length over the given one, about 0
+    prior[6, 6] = focal_sigma**-2
     solved_at = np.array([0, 0, 0, 0, 0, 0, 0.2])
     near_at = rng.normal(0, 0.1, 7) * [1, 1, 1, 0, 0, 0, 1]  # motions without rotation add up
     # Each estimate is (Λ + Λ₀)⁻¹ Λ m of its measurements m.
@@ -204,7 +219,11 @@ def test_features_and_light_are_joined_like_their_measurements(seed: int) -> Non
         return Aligned(moved(pose, at[:6]), 1.0, 0.0, covariance, 1.0, 3, 2.0, float(np.exp(at[6])))
 
     solved = SimpleNamespace(
-        viewmat=pose, information=of_features, focal_sigma=focal_sigma, depth=2.0, zoom=float(np.exp(0.2))
+        viewmat=pose,
+        information=of_features,
+        focal_sigma=focal_sigma,
+        depth=2.0,
+        zoom=float(np.exp(0.2)),
     )
     found = {}
     for refine in ("auto", "none", "photometric"):
@@ -218,5 +237,9 @@ def test_features_and_light_are_joined_like_their_measurements(seed: int) -> Non
     joined = np.array([*motion_between(pose, found["auto"].viewmat), np.log(found["auto"].zoom)])
     np.testing.assert_allclose(joined, expected, atol=1e-9)
     np.testing.assert_allclose(found["auto"].covariance, np.linalg.inv(of_all), atol=1e-9)
-    np.testing.assert_allclose(found["none"].covariance, np.linalg.inv(of_features + prior), atol=1e-9)
-    np.testing.assert_allclose(found["photometric"].covariance, np.linalg.inv(of_light + prior), atol=1e-9)
+    np.testing.assert_allclose(
+        found["none"].covariance, np.linalg.inv(of_features + prior), atol=1e-9
+    )
+    np.testing.assert_allclose(
+        found["photometric"].covariance, np.linalg.inv(of_light + prior), atol=1e-9
+    )

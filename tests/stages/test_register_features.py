@@ -213,7 +213,8 @@ def test_extras_name_pycolmap_where_it_has_wheels() -> None:
         marker = requirements.Requirement(found).marker
         for system in ("linux", "darwin", "win32"):
             for machine in ("x86_64", "AMD64", "aarch64", "arm64", "ARM64"):
-                if (system, machine) not in (("linux", "AMD64"), ("win32", "x86_64")):  # not their names
+                # not their names
+                if (system, machine) not in (("linux", "AMD64"), ("win32", "x86_64")):
                     named = marker.evaluate({"sys_platform": system, "platform_machine": machine})
                     assert named == ((system, machine) in module._PYCOLMAP_PLATFORMS)
 
@@ -240,10 +241,15 @@ def test_a_pycolmap_that_does_not_load_is_reported(monkeypatch: pytest.MonkeyPat
         ("match = 3", "plugin has no function match"),
         ("def match(a, b): return 5", "expected two (M, 2) arrays"),
         ("def match(a, b): raise SystemExit(3)", "plugin:match: SystemExit: 3"),
-        ("def match(a, b): raise ValueError('out\\nof luck')", "plugin:match: ValueError: out of luck"),
+        (
+            "def match(a, b): raise ValueError('out\\nof luck')",
+            "plugin:match: ValueError: out of luck",
+        ),
     ],
 )
-def test_failing_plugins(source: str | None, words: str, command_line: CommandLine, tmp_path: Path) -> None:
+def test_failing_plugins(
+    source: str | None, words: str, command_line: CommandLine, tmp_path: Path
+) -> None:
     pytest.importorskip("pycolmap")
     _one_view(tmp_path)
     if source is not None:
@@ -274,7 +280,9 @@ def _one_view(folder: Path) -> None:
     views = _photographed(folder, 1)
     write_splats(folder / "scene.ply", BALL)
     write_views(folder / "views.json", views)
-    write_views(folder / "coarse.json", replace(views, viewmats=off(views.viewmats[0], 0.1, 3, 0)[None]))
+    write_views(
+        folder / "coarse.json", replace(views, viewmats=off(views.viewmats[0], 0.1, 3, 0)[None])
+    )
 
 
 @pytest.mark.parametrize(("gain", "bias"), [(1.6, 0.0), (1.0, -0.1)])
@@ -343,7 +351,9 @@ np.savez(sys.argv[3], matches_im0=photo.astype(int), matches_im1=render.astype(i
 
 def _mast3r_adapter() -> str:
     text = (ROOT / "docs/methods/register.md").read_text(encoding="utf-8")
-    return next(b for b in re.findall(r"(?ms)^```python\n(.*?)^```", text) if "mast3r_pairs.py" in b)
+    return next(
+        b for b in re.findall(r"(?ms)^```python\n(.*?)^```", text) if "mast3r_pairs.py" in b
+    )
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="needs a script that runs by its first line")
@@ -375,4 +385,5 @@ def test_the_documented_adapter_reads_mast3rs_matches(tmp_path: Path) -> None:
     np.testing.assert_allclose(b, [[0.98, 0.98], [999.02, 749.02]], atol=0.01)
     np.savez(tmp_path / "n.npz", matches_im0=[[0, 0]], matches_im1=[[0, 0]])
     (a, _) = names["pairs"](tmp_path / "n.npz", np.zeros((600, 1000, 3)), render)
-    np.testing.assert_allclose(a, [[0.98, 0.5 * 1000 / 512 + 1 * 1000 / 512]], atol=0.01)  # 307 rows, one cut
+    # 307 rows, one cut
+    np.testing.assert_allclose(a, [[0.98, 0.5 * 1000 / 512 + 1 * 1000 / 512]], atol=0.01)

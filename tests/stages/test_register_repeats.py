@@ -55,7 +55,10 @@ def test_a_thing_that_neither_render_has_makes_a_choice_doubtful() -> None:
 
 def _wall(door: bool) -> Splats:
     """A wall, two units high, of five like panels one unit wide; with a door, one is red at its middle."""
-    x, y = (a.ravel() for a in np.meshgrid(np.arange(-2.5, 2.5, 0.04) + 0.02, np.arange(-1, 1, 0.04) + 0.02))
+    x, y = (
+        a.ravel()
+        for a in np.meshgrid(np.arange(-2.5, 2.5, 0.04) + 0.02, np.arange(-1, 1, 0.04) + 0.02)
+    )
     panel = np.random.default_rng(7).random((12, 6, 3))
     color = panel[((y + 1) * 6).astype(int), ((x + 2.5) % 1 * 6).astype(int)]
     if door:

@@ -44,7 +44,9 @@ def ball(count=1500, seed=0, offset=(0.0, 0.0, 0.0)) -> Splats:
     return Splats.create(
         np.concatenate([n, pillar]),
         quats=np.concatenate([quats, np.tile([1.0, 0, 0, 0], (len(pillar), 1))]),
-        scales=np.concatenate([np.tile([0.08, 0.08, 0.01], (count, 1)), np.full((len(pillar), 3), 0.06)]),
+        scales=np.concatenate(
+            [np.tile([0.08, 0.08, 0.01], (count, 1)), np.full((len(pillar), 3), 0.06)]
+        ),
         logit_opacities=rng.uniform(0, 5, count + len(pillar)),
         offset=offset,
     )
@@ -68,12 +70,15 @@ def test_view_statistics_are_the_naive_renderers(offset):
     cameras = around(3).recentred(-np.asarray(offset))
     parts, origin = surfaces.core_scene(scene)
     found = _core.select_view_statistics(parts, surfaces.core_views(cameras, origin, parts))
-    grid = np.stack(np.meshgrid(np.arange(SIZE[0]) + 0.5, np.arange(SIZE[1]) + 0.5), -1).reshape(-1, 2)
+    grid = np.stack(np.meshgrid(np.arange(SIZE[0]) + 0.5, np.arange(SIZE[1]) + 0.5), -1).reshape(
+        -1, 2
+    )
     for (share, median), viewmat in zip(found, cameras.viewmats, strict=True):
         depth = naive.median_depth(scene, viewmat, K, grid)
         shown = np.sort(depth[depth > 0])
         assert len(shown) > 800
-        assert abs(share - len(shown) / len(depth)) < 0.002  # float32 may cross one half a splat later
+        # float32 may cross one half a splat later
+        assert abs(share - len(shown) / len(depth)) < 0.002
         assert shown[len(shown) // 2 - 5] * 0.9999 < median < shown[len(shown) // 2 + 5] * 1.0001
 
 
@@ -130,13 +135,16 @@ def test_greedy_is_the_naive_greedy(alpha):
         assert order.tolist() == want
         np.testing.assert_allclose(gains, value, rtol=1e-6, atol=1e-12)
         assert np.all(np.diff(gains) <= 1e-12)  # submodular: gains never rise
-        assert evaluations < 12 + 11 + 10 + 9 + 8 + 7  # those of a search that evaluates every view again
+        # those of a search that evaluates every view again
+        assert evaluations < 12 + 11 + 10 + 9 + 8 + 7
 
 
 def test_directions_and_epsilon_are_options():
     made, seen, positions = random_problem(np.random.default_rng(5))
     order, gains, _ = run_greedy(made, seen, positions, 6, anchors=48, epsilon=0.1)
-    want, value = naive.greedy(6, made, seen, positions, directional=True, directions=48, epsilon=0.1)
+    want, value = naive.greedy(
+        6, made, seen, positions, directional=True, directions=48, epsilon=0.1
+    )
     assert order.tolist() == want
     np.testing.assert_allclose(gains, value, rtol=1e-6, atol=1e-12)
     _, usual, _ = run_greedy(made, seen, positions, 6)
@@ -164,7 +172,10 @@ def test_auto_reaches_every_pose_and_then_represents(count):
 def test_outlooks_count_surface_in_front():
     scene = ball()
     coarse = surface(scene, 2000)
-    facing, back = views([[0, -4.0, 0], [0, -4.0, 0]]), views([[0, -4.0, 0]], targets=[[0, -8.0, 0]])
+    facing, back = (
+        views([[0, -4.0, 0], [0, -4.0, 0]]),
+        views([[0, -4.0, 0]], targets=[[0, -8.0, 0]]),
+    )
     depths, shares = poses.outlooks(coarse, facing)
     assert depths[0] == depths[1] > 2
     assert 0.2 < shares[0] < 0.8  # not what the ball's front hides
@@ -177,7 +188,9 @@ def test_auto_leaves_the_crowd():
     rng = np.random.default_rng(3)
     crowd = np.array([4.0, 0, 0]) + 0.05 * rng.standard_normal((90, 3))
     ring = np.linspace(0.5, 2 * np.pi - 0.5, 10)
-    cameras = views(np.concatenate([crowd, 4 * np.stack([np.cos(ring), np.sin(ring), 0 * ring], 1)]))
+    cameras = views(
+        np.concatenate([crowd, 4 * np.stack([np.cos(ring), np.sin(ring), 0 * ring], 1)])
+    )
     assert (select(ball(), cameras, 10).order >= 90).sum() >= 8
     many = select(ball(), cameras, 100)
     assert many.weights.mean() == pytest.approx(1.0)
@@ -212,7 +225,9 @@ def test_every_policy_on_every_pool(policy):
     assert len(set(same.order.tolist())) == 3
     assert np.isfinite(same.gains).all()
     assert same.weights.sum() == pytest.approx(3)
-    away = views([[4.0, 0, 0], [0, 4.0, 0], [9.0, 9, 9]], np.array([[0.0, 0, 0], [0, 0, 0], [99, 99, 99]]))
+    away = views(
+        [[4.0, 0, 0], [0, 4.0, 0], [9.0, 9, 9]], np.array([[0.0, 0, 0], [0, 0, 0], [99, 99, 99]])
+    )
     partly = run(away, 3)
     assert sorted(partly.order.tolist()) == [0, 1]
     assert partly.refused.tolist() == [2]
@@ -224,8 +239,12 @@ def test_a_view_within_matter_is_refused(tmp_path):
     rng = np.random.default_rng(5)
     solid = rng.standard_normal((6000, 3))
     solid *= (rng.random(6000) ** (1 / 3) / np.linalg.norm(solid, axis=1))[:, None]
-    scene = Splats.create(solid, scales=np.full((6000, 3), 0.04), logit_opacities=np.full(6000, 3.0))
-    pool = views([[4.0, 0, 0], [0.2, 0.1, 0], [0, 4.0, 0]], np.array([[0.0, 0, 0], [3, 0, 0.1], [0, 0, 0]]))
+    scene = Splats.create(
+        solid, scales=np.full((6000, 3), 0.04), logit_opacities=np.full(6000, 3.0)
+    )
+    pool = views(
+        [[4.0, 0, 0], [0.2, 0.1, 0], [0, 4.0, 0]], np.array([[0.0, 0, 0], [3, 0, 0.1], [0, 0, 0]])
+    )
     for policy in POLICIES:
         chosen = select(scene, pool, 3, policy=policy, options=CoverageOptions(cells=1000))
         assert sorted(chosen.order.tolist()) == [0, 2]
@@ -257,7 +276,9 @@ def test_a_view_is_within_matter_nearer_than_a_fiftieth_of_the_usual_depth():
 def test_auto_k_stops_at_the_bend():
     ring = np.repeat(np.linspace(0, 2 * np.pi, 6, endpoint=False), 10)
     rng = np.random.default_rng(4)
-    places = 4 * np.stack([np.cos(ring), np.sin(ring), 0 * ring], 1) + 0.02 * rng.standard_normal((60, 3))
+    places = 4 * np.stack([np.cos(ring), np.sin(ring), 0 * ring], 1) + 0.02 * rng.standard_normal(
+        (60, 3)
+    )
     chosen = select(ball(), views(places), "auto")
     assert len(chosen.order) == 6
     assert len(set((chosen.order // 10).tolist())) == 6
@@ -267,7 +288,9 @@ def test_auto_k_stops_at_the_bend():
 def test_neither_threads_nor_runs_change_anything():
     scene, pool = ball(), around(25)
     options = CoverageOptions(cells=800)
-    first, *others = on_threads(lambda: select(scene, pool, 10, policy="directional", options=options))
+    first, *others = on_threads(
+        lambda: select(scene, pool, 10, policy="directional", options=options)
+    )
     for other in others:
         np.testing.assert_array_equal(other.order, first.order)
         np.testing.assert_array_equal(other.gains, first.gains)
@@ -284,7 +307,12 @@ def test_offset_and_scale_change_nothing():
 
 @pytest.mark.parametrize(
     ("k", "policy", "words"),
-    [(0, "auto", "k"), (2.5, "auto", "k"), (3, "best", "policy"), (3, "random", "auto, directional")],
+    [
+        (0, "auto", "k"),
+        (2.5, "auto", "k"),
+        (3, "best", "policy"),
+        (3, "random", "auto, directional"),
+    ],
 )
 def test_invalid_arguments_are_named(k, policy, words):
     with pytest.raises(InputError, match=words):

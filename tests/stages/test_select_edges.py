@@ -23,7 +23,9 @@ BALL = checkered_ball(800)
 
 def balls(count: int) -> Splats:
     """Balls along x, 50 apart."""
-    return join([replace(BALL, means=BALL.means + np.float32([50 * i, 0, 0])) for i in range(count)])
+    return join(
+        [replace(BALL, means=BALL.means + np.float32([50 * i, 0, 0])) for i in range(count)]
+    )
 
 
 @pytest.mark.parametrize("policy", POLICIES)
@@ -76,14 +78,32 @@ def test_invalid_poses_are_rejected() -> None:
         select(BALL, pool.take([]), 1)
 
 
-def test_the_command_says_which_views_see_nothing(command_line: CommandLine, tmp_path: Path) -> None:
+def test_the_command_says_which_views_see_nothing(
+    command_line: CommandLine, tmp_path: Path
+) -> None:
     write_splats(tmp_path / "ball.ply", BALL)
     away = look_at([30.0, 0, 0], [60, 0, 0])
-    ask = ("select", "ball.ply", "--views", "pool.json", "-k", 5, "--split", "all", "-o", "out.json")
+    ask = (
+        "select",
+        "ball.ply",
+        "--views",
+        "pool.json",
+        "-k",
+        5,
+        "--split",
+        "all",
+        "-o",
+        "out.json",
+    )
     write_views(tmp_path / "pool.json", views_at([*around(4).viewmats, away]))
     out, told = succeeds(command_line, tmp_path, *ask, "--json", "-")
     said = json.loads(out)
-    assert len(said["views"]) == len(said["curve"]) == len(read_view_set(tmp_path / "out.json").cameras) == 4
+    assert (
+        len(said["views"])
+        == len(said["curve"])
+        == len(read_view_set(tmp_path / "out.json").cameras)
+        == 4
+    )
     assert len(said["refused"]) == 1
     assert "1 view not used" in told
     write_views(tmp_path / "pool.json", views_at([away]), overwrite=True)

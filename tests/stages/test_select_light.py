@@ -17,7 +17,9 @@ from reference import select as naive
 @given(st.integers(0, 2**32 - 1), st.integers(1, 9), st.integers(1, 40), st.integers(0, 9))
 def test_greedy_equals_trying_all(seed: int, views: int, rows: int, k: int) -> None:
     rng = np.random.default_rng(seed)
-    received = rng.exponential(size=(views, rows)).astype(np.float32) * (rng.random((views, rows)) < 0.5)
+    received = rng.exponential(size=(views, rows)).astype(np.float32) * (
+        rng.random((views, rows)) < 0.5
+    )
     before = rng.exponential(size=rows) * 3
     chosen, gains = _core.select_light(received, before, k)
     expected, their_gains = naive.brightest(received, before, k)
@@ -48,7 +50,9 @@ def test_invalid_light_is_refused(value: float) -> None:
 def row_of_balls(count: int = 6) -> Splats:
     """Clusters of small Gaussians, 10 apart along x."""
     rng = np.random.default_rng(1)
-    means = rng.normal(size=(count * 50, 3)) * 0.5 + np.repeat(np.arange(count) * 10.0, 50)[:, None] * (
+    means = rng.normal(size=(count * 50, 3)) * 0.5 + np.repeat(np.arange(count) * 10.0, 50)[
+        :, None
+    ] * (
         1,
         0,
         0,
@@ -59,7 +63,9 @@ def row_of_balls(count: int = 6) -> Splats:
 
 
 def before_ball(x: float, distance: float = 4.0) -> Camera:
-    return Camera.facing([x, -distance, 0], [x, 0, 0], width=160, height=120, name=f"view_{x:g}_{distance:g}")
+    return Camera.facing(
+        [x, -distance, 0], [x, 0, 0], width=160, height=120, name=f"view_{x:g}_{distance:g}"
+    )
 
 
 def test_views_of_what_is_unseen_come_first_and_what_is_known_is_not_added() -> None:

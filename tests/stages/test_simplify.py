@@ -42,22 +42,31 @@ def test_threads_do_not_matter(method):
 def test_row_order_does_not_matter(method):
     prior = scene()
     rows = np.random.default_rng(1).permutation(len(prior))
-    here, there = simplify(prior, 300, method=method), simplify(prior.take(rows), 300, method=method)
+    here, there = (
+        simplify(prior, 300, method=method),
+        simplify(prior.take(rows), 300, method=method),
+    )
     assert_same_bits(here.splats, there.splats)
     np.testing.assert_array_equal(here.parents[rows], there.parents)
     np.testing.assert_array_equal(here.protected, there.protected)
 
 
 @pytest.mark.parametrize("method", METHODS)
-@pytest.mark.parametrize(("factor", "shift"), [(1.0, 2.0**20), (2.0**-7, 0.0), (2.0**9, -(2.0**15))])
+@pytest.mark.parametrize(
+    ("factor", "shift"), [(1.0, 2.0**20), (2.0**-7, 0.0), (2.0**9, -(2.0**15))]
+)
 def test_moving_and_scaling_by_powers_of_two_is_exact(method, factor, shift):
     prior = scene(dtype=np.float64)
-    moved = replace(prior, means=prior.means * factor + shift, scales=prior.scales * np.float32(factor))
+    moved = replace(
+        prior, means=prior.means * factor + shift, scales=prior.scales * np.float32(factor)
+    )
     here, there = (simplify(s, 300, method=method) for s in (prior, moved))
     np.testing.assert_array_equal(there.splats.means, here.splats.means * factor + shift)
     np.testing.assert_array_equal(there.splats.scales, here.splats.scales * np.float32(factor))
     for name in ("quats", "logit_opacities", "sh0", "shN"):
-        np.testing.assert_array_equal(getattr(there.splats, name), getattr(here.splats, name), err_msg=name)
+        np.testing.assert_array_equal(
+            getattr(there.splats, name), getattr(here.splats, name), err_msg=name
+        )
     np.testing.assert_array_equal(there.parents, here.parents)
 
 
@@ -87,7 +96,9 @@ def odd_scenes():
     logits = np.where(rng.random(500) < 0.5, 1e4, -1e4)
     points, dots, most = (base.scales.copy() for _ in range(3))
     points[:], dots[:], most[rng.random(500) < 0.6] = 0, np.exp(-30), np.exp(-30)
-    endless = np.where(np.arange(500) % 3 == 0, np.inf, np.where(np.arange(500) % 3 == 1, -np.inf, 0.3))
+    endless = np.where(
+        np.arange(500) % 3 == 0, np.inf, np.where(np.arange(500) % 3 == 1, -np.inf, 0.3)
+    )
     return {
         "identical": base.take(one),
         "one": base.take([0]),
@@ -152,7 +163,9 @@ def test_the_papers_schedule_reports_skipped_steps():
     prior = scene(2000)
     out = simplify(prior, 1500, method="paper")
     assert out.report.skipped["coverages"] == sum(r.refused["energy"] for r in out.report.rounds)
-    faint = replace(prior, logit_opacities=np.where(np.arange(2000) < 1500, 0, -9).astype(np.float32))
+    faint = replace(
+        prior, logit_opacities=np.where(np.arange(2000) < 1500, 0, -9).astype(np.float32)
+    )
     dropped = simplify(faint, 1500, method="paper").report.skipped
     assert (dropped["binnings"], dropped["trims"]) == (1, 1)
     assert "binnings" not in simplify(prior, 200).report.skipped
@@ -160,7 +173,9 @@ def test_the_papers_schedule_reports_skipped_steps():
 
 @pytest.mark.parametrize("method", METHODS)
 def test_dropped_rows_are_reported_even_if_nothing_merges(method):
-    faint = replace(scene(1000), logit_opacities=np.where(np.arange(1000) < 300, -9, 3).astype(np.float32))
+    faint = replace(
+        scene(1000), logit_opacities=np.where(np.arange(1000) < 300, -9, 3).astype(np.float32)
+    )
     out = simplify(faint, 700, method=method)
     assert (out.parents == -1).tolist() == [True] * 300 + [False] * 700
     rounds = out.report.rounds
@@ -202,7 +217,11 @@ def test_bad_input_is_named():
         simplify(prior, 5, protected=np.zeros(49, bool))
     with pytest.raises(InputError, match="none of the 50 rows is finite"):
         simplify(replace(prior, means=prior.means * np.nan), 5)
-    for wrong in ({"retention": 1.0}, {"morton_premerge_ratio": np.nan}, {"morton_premerge_steps": 0}):
+    for wrong in (
+        {"retention": 1.0},
+        {"morton_premerge_ratio": np.nan},
+        {"morton_premerge_steps": 0},
+    ):
         with pytest.raises(InputError, match=next(iter(wrong))):
             SimplifyConfig(**wrong)
 
@@ -236,7 +255,9 @@ def test_the_report_adds_up(method):
 def test_an_invisible_scene_shrinks_evenly(method, logit):
     rng = np.random.default_rng(6)
     prior = Splats.create(
-        rng.uniform(-1, 1, (2000, 3)), scales=np.full((2000, 3), 0.05), logit_opacities=np.full(2000, logit)
+        rng.uniform(-1, 1, (2000, 3)),
+        scales=np.full((2000, 3), 0.05),
+        logit_opacities=np.full(2000, logit),
     )
     out = simplify(prior, 1000, method=method)
     assert_sound(out, 2000, 1000)

@@ -19,7 +19,8 @@ from helpers.simplify_cases import Views, all_alike, assert_kept, assert_sound, 
 from reference import simplify as naive
 
 
-@pytest.mark.parametrize(("method", "least"), [("default", 0.6), ("fast", 0.55)])  # fast cuts coarser
+# fast cuts coarser
+@pytest.mark.parametrize(("method", "least"), [("default", 0.6), ("fast", 0.55)])
 def test_visible_gaussians_keep_more_detail(method, least):
     prior = scene(4000)
     left = prior.means[:, 0] < 0
@@ -75,8 +76,11 @@ def test_clusters_conserve_mass_mean_and_covariance(method, growth):
             assert_kept(prior, rows[0], small, p)
             continue
         mean, cov, alpha, sh = naive.merge_as_rendered(prior, rows, e2, growth)
-        np.testing.assert_allclose(small.means[p], mean, rtol=0, atol=1e-7)  # blur and α are float32
-        np.testing.assert_allclose(naive.covariance(small, p), cov, rtol=0, atol=1e-6 * np.trace(cov))
+        # blur and α are float32
+        np.testing.assert_allclose(small.means[p], mean, rtol=0, atol=1e-7)
+        np.testing.assert_allclose(
+            naive.covariance(small, p), cov, rtol=0, atol=1e-6 * np.trace(cov)
+        )
         np.testing.assert_allclose(small.opacities[p], alpha, rtol=1e-4)
         np.testing.assert_allclose(np.r_[small.sh0[p], small.shN[p]], sh, rtol=0, atol=1e-5)
 
@@ -110,7 +114,9 @@ def test_opacities_are_fitted_and_all_else_is_the_members():
             held = min(wanted, max(alpha, 0.99))
             np.testing.assert_allclose(out.splats.means[p], mean, rtol=0, atol=1e-7)
             np.testing.assert_allclose(out.splats.opacities[p], held, rtol=1e-4)
-            np.testing.assert_allclose(np.r_[out.splats.sh0[p], out.splats.shN[p]], sh, rtol=0, atol=1e-5)
+            np.testing.assert_allclose(
+                np.r_[out.splats.sh0[p], out.splats.shN[p]], sh, rtol=0, atol=1e-5
+            )
             areas = [
                 np.sort(np.linalg.eigvalsh(c))[1:].prod() ** 0.5
                 for c in (naive.covariance(out.splats, p), cov)
@@ -121,7 +127,9 @@ def test_opacities_are_fitted_and_all_else_is_the_members():
 def test_no_merged_cluster_is_dropped():
     rng = np.random.default_rng(4)
     prior = Splats.create(
-        rng.uniform(0, 100, (2000, 3)), scales=np.full((2000, 3), 0.01), logit_opacities=np.full(2000, 2)
+        rng.uniform(0, 100, (2000, 3)),
+        scales=np.full((2000, 3), 0.01),
+        logit_opacities=np.full(2000, 2),
     )
     out = simplify(prior, 200, visibility=all_alike)
     assert_sound(out, 2000, 200)
@@ -135,7 +143,9 @@ def test_visibility_does_not_depend_on_the_order_of_rows(method, count, scale):
     viewmats = cameras.viewmats.copy()
     viewmats[:, :3, 3] *= scale
     cameras = replace(cameras, viewmats=viewmats)
-    wall = replace(wall, means=wall.means * np.float32(scale), scales=wall.scales * np.float32(scale))
+    wall = replace(
+        wall, means=wall.means * np.float32(scale), scales=wall.scales * np.float32(scale)
+    )
     shuffled = np.random.default_rng(8).permutation(len(wall))
     a = simplify(wall, count, method=method, visibility=visibility_source(cameras))
     b = simplify(wall.take(shuffled), count, method=method, visibility=visibility_source(cameras))
@@ -148,12 +158,16 @@ def test_clusters_of_many_get_the_colours_that_views_show():
     """The members behind the front of a ball hardly count, though they have as much mass."""
     front = checkered_ball(4000).with_sh_degree(0)
     red, views = np.array([3.0, -1.0, -1.0], np.float32), around(12)
-    behind = replace(front, means=front.means * np.float32(0.97), sh0=np.broadcast_to(red, (4000, 1, 3)))
+    behind = replace(
+        front, means=front.means * np.float32(0.97), sh0=np.broadcast_to(red, (4000, 1, 3))
+    )
     both = join([front, behind])
 
     def off(count):
         small = simplify(both, count, visibility=visibility_source(views)).splats
-        return np.mean([np.abs(render(small, v).image - render(both, v).image).mean() for v in views])
+        return np.mean(
+            [np.abs(render(small, v).image - render(both, v).image).mean() for v in views]
+        )
 
     assert off(400) < 0.7 * off(401)
 
@@ -228,4 +242,6 @@ def test_what_opacity_cannot_hold_widens_the_longer_axes() -> None:
     before, after = _fitted([0.98], 3, 16.0, 1.0)
     growth = 0.98 * 2**0.25 / 0.99  # the ratio of visibility is limited to 2
     np.testing.assert_allclose(after.opacities, 0.99, rtol=1e-5)
-    np.testing.assert_allclose(after.scales / before.scales, [[growth**0.5, 1, growth**0.5]], rtol=1e-5)
+    np.testing.assert_allclose(
+        after.scales / before.scales, [[growth**0.5, 1, growth**0.5]], rtol=1e-5
+    )

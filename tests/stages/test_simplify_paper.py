@@ -33,7 +33,9 @@ def test_paper_merges_as_the_naive_twin_and_conserves_moments():
             continue
         mean, cov, alpha, sh, _ = naive.merge(prior, rows)
         np.testing.assert_allclose(small.means[p], mean, rtol=0, atol=1e-9)
-        np.testing.assert_allclose(naive.covariance(small, p), cov, rtol=0, atol=1e-6 * np.trace(cov))
+        np.testing.assert_allclose(
+            naive.covariance(small, p), cov, rtol=0, atol=1e-6 * np.trace(cov)
+        )
         np.testing.assert_allclose(small.opacities[p], alpha, rtol=1e-5)
         np.testing.assert_allclose(np.r_[small.sh0[p], small.shN[p]], sh, rtol=0, atol=1e-5)
 
@@ -93,7 +95,9 @@ def test_coverage_equals_the_naive_twin():
         partly += 0.1 < covered < 0.9
         for margin, refused in ((-0.06, 0), (0.06, 1)):
             least = max(0, covered + margin)
-            out = one_round(prior, 1, np.zeros(n, bool), min_opacity=0, max_energy=10, min_coverage=least)
+            out = one_round(
+                prior, 1, np.zeros(n, bool), min_opacity=0, max_energy=10, min_coverage=least
+            )
             assert out.report.rounds[0].refused == {"energy": 0, "coverage": refused}, n
     assert partly > 3
 
@@ -144,7 +148,9 @@ def test_a_round_on_the_way_has_the_cells_of_the_final_budget():
 
 def test_flat_smooth_discs_reach_the_budget_by_merging():
     points = sheet(60)
-    smooth = np.stack([0.3 + 0.002 * points[:, 0], 0.3 + 0.002 * points[:, 1], 0 * points[:, 0] + 0.4], 1)
+    smooth = np.stack(
+        [0.3 + 0.002 * points[:, 0], 0.3 + 0.002 * points[:, 1], 0 * points[:, 0] + 0.4], 1
+    )
     out = simplify(discs(points, smooth), 360, method="paper")
     assert shed(out, "merged") >= 0.98 * (3600 - 360)
     assert [r.after for r in out.report.rounds][-1] == 360
@@ -256,7 +262,8 @@ def test_energy_and_flags_part_at_a_hundredth_summed_over_channels(other, passes
 @pytest.mark.parametrize(("flat", "passes"), [(61, True), (59, False)])
 def test_coverage_parts_at_six_tenths_of_the_footprint_area(flat, passes):
     points = sheet(10)
-    upright = np.random.default_rng(3).permutation(100) >= flat  # edge-on: no footprint on the floor
+    # edge-on: no footprint on the floor
+    upright = np.random.default_rng(3).permutation(100) >= flat
     prior = discs(points, width=0.1, thickness=0.002)
     prior.quats[upright] = [np.sqrt(0.5), np.sqrt(0.5), 0, 0]
     out = one_round(prior, 1)
@@ -271,7 +278,8 @@ def thinned(areas, alphas, budget, flags=None):
     scales = np.stack([np.sqrt(areas) * 1.5, np.sqrt(areas) / 1.5, np.full(len(areas), 1e-3)], 1)
     prior = Splats.create(points, scales=scales, logit_opacities=np.log(alphas / (1 - alphas)))
     flags = np.zeros(len(areas), bool) if flags is None else flags
-    return one_round(prior, budget, flags, min_coverage=2).parents >= 0  # nothing merges, so trims decide
+    # nothing merges, so trims decide
+    return one_round(prior, budget, flags, min_coverage=2).parents >= 0
 
 
 @pytest.mark.parametrize("by", ["area", "opacity"])

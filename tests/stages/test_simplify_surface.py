@@ -50,7 +50,9 @@ def ball(seed: int, count: int = 6000) -> Splats:
     """Return a ball of Gaussians of all opacities, dense at its surface."""
     rng = np.random.default_rng(seed)
     points = rng.normal(size=(count, 3))
-    points *= (1 - 0.25 * rng.random((count, 1)) ** 2) / np.linalg.norm(points, axis=1, keepdims=True)
+    points *= (1 - 0.25 * rng.random((count, 1)) ** 2) / np.linalg.norm(
+        points, axis=1, keepdims=True
+    )
     return Splats.create(
         points,
         quats=rng.normal(size=(count, 4)),
@@ -85,7 +87,9 @@ def lost(dense: Splats, small: Splats) -> float:
 def likeness(dense: Splats, small: Splats) -> float:
     """Return the mean PSNR of a result."""
     before, after = Renderer(dense), Renderer(small)
-    return float(np.mean([psnr(after.clipped(view), before.clipped(view)) for view in around(dense)]))
+    return float(
+        np.mean([psnr(after.clipped(view), before.clipped(view)) for view in around(dense)])
+    )
 
 
 def reduced(scene: Splats, ratio: float, *, seen: bool, method: str = "default", **how: Any) -> Any:
@@ -96,7 +100,9 @@ def reduced(scene: Splats, ratio: float, *, seen: bool, method: str = "default",
 @pytest.mark.parametrize("seen", [True, False])
 @pytest.mark.parametrize("method", ["default", "fast"])
 @pytest.mark.parametrize(("ratio", "most"), [(5, 0.03), (10, 0.06), (24, 0.11), (50, 0.2)])
-def test_a_surface_of_one_layer_stays_closed(ratio: float, most: float, method: str, seen: bool) -> None:
+def test_a_surface_of_one_layer_stays_closed(
+    ratio: float, most: float, method: str, seen: bool
+) -> None:
     scene = plane(ratio)
     through = lost(scene, reduced(scene, ratio, seen=seen, method=method).splats)
     assert through < most
@@ -107,11 +113,15 @@ def test_a_surface_of_one_layer_stays_closed(ratio: float, most: float, method: 
 
 @pytest.mark.parametrize("seen", [True, False])
 @pytest.mark.parametrize("kind", [plane, stack, ball])
-def test_every_scene_is_better_than_without_growth(kind: Callable[[int], Splats], seen: bool) -> None:
+def test_every_scene_is_better_than_without_growth(
+    kind: Callable[[int], Splats], seen: bool
+) -> None:
     scene = kind(1)
     fixed = reduced(scene, 12, seen=seen, config=SimplifyConfig(max_growth=1))
     assert fixed.report.clamped_opacities > 0.3 * len(fixed.splats)
-    assert likeness(scene, reduced(scene, 12, seen=seen).splats) > likeness(scene, fixed.splats) + 0.5
+    assert (
+        likeness(scene, reduced(scene, 12, seen=seen).splats) > likeness(scene, fixed.splats) + 0.5
+    )
 
 
 @pytest.mark.parametrize("kind", [plane, stack, ball])
@@ -128,7 +138,9 @@ def test_rows_widen_by_what_the_naive_twin_says(kind: Callable[[int], Splats], m
     growth = small.scales.prod(axis=1, dtype=float) / as_merged.scales.prod(axis=1, dtype=float)
     np.testing.assert_allclose(growth, np.minimum(needed, limit), rtol=1e-4)
     shortest = np.argmin(as_merged.scales, axis=1)[:, None]
-    np.testing.assert_array_equal(*(np.take_along_axis(s.scales, shortest, 1) for s in (small, as_merged)))
+    np.testing.assert_array_equal(
+        *(np.take_along_axis(s.scales, shortest, 1) for s in (small, as_merged))
+    )
 
 
 @pytest.mark.parametrize("seen", [True, False])
@@ -145,7 +157,9 @@ def test_gaps_are_measured_in_the_views_that_weigh_rows() -> None:
     out = reduced(scene, 24, seen=True, gaps=True, config=little)
     assert out.report.opacity_lost == pytest.approx(lost(scene, out.splats), rel=0.5)
     assert out.report.opacity_lost == opacity_lost(scene, out.splats, around(scene, 6))
-    assert reduced(scene, 24, seen=True, gaps=True).report.opacity_lost < 0.5 * out.report.opacity_lost
+    assert (
+        reduced(scene, 24, seen=True, gaps=True).report.opacity_lost < 0.5 * out.report.opacity_lost
+    )
     assert reduced(scene, 24, seen=True, config=little).report.opacity_lost is None
     assert reduced(scene, 24, seen=False, gaps=True).report.opacity_lost is None
 

@@ -98,7 +98,10 @@ class _Line:
 
 
 def _settled(
-    line: _Line, stencil: tuple[tuple[int, float], ...], scale: float, ladder: tuple[float, ...] = LADDER
+    line: _Line,
+    stencil: tuple[tuple[int, float], ...],
+    scale: float,
+    ladder: tuple[float, ...] = LADDER,
 ) -> float | str | None:
     """The slope on which two steps of the ladder agree best; None if none do, a kind if all of them cross."""
     slopes: list[float] = []
@@ -117,7 +120,9 @@ def _settled(
     if not slopes:
         return kind or None
     gaps = np.abs(np.diff(slopes))
-    if len(gaps) and gaps.min() <= 0.5 * TWIN_TOLERANCE * max(abs(slopes[int(gaps.argmin())]), scale):
+    if len(gaps) and gaps.min() <= 0.5 * TWIN_TOLERANCE * max(
+        abs(slopes[int(gaps.argmin())]), scale
+    ):
         return slopes[int(gaps.argmin())]
     return None
 
@@ -203,7 +208,11 @@ def check_problem(
         grad = tensor.grad if tensor.grad is not None else torch.zeros_like(tensor)
         places = [edge[1]] if edge is not None and edge[0] == name else []
         while len(places) < per_class:
-            row = rng.choice(shown) if len(shown) and rng.random() < 0.95 else rng.integers(len(tensor))
+            row = (
+                rng.choice(shown)
+                if len(shown) and rng.random() < 0.95
+                else rng.integers(len(tensor))
+            )
             places.append((int(row), *(int(rng.integers(s)) for s in tensor.shape[1:])))
         for at in places:
             _check(problem, name, at, (grad.numpy(), engine[name]), tallies[name], f"seed {seed}")
@@ -220,7 +229,9 @@ def _at_an_edge(
     problem: Problem, rng: np.random.Generator
 ) -> tuple[Problem, tuple[str, tuple[int, ...]] | None]:
     """One coordinate moved to half a step from a clip, a dark colour or the field of view's clamp; which."""
-    name, kind = [("logit_opacities", "clip"), ("sh0", "dark"), ("means", "clamp")][int(rng.integers(3))]
+    name, kind = [("logit_opacities", "clip"), ("sh0", "dark"), ("means", "clamp")][
+        int(rng.integers(3))
+    ]
     row = int(rng.integers(len(problem.params[name])))
     if kind == "clip":  # only a splat that covers a pixel's centre squarely can reach it
         row = int(problem.oracle(problem.params)[0].weight.amax(1).argmax())

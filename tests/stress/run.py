@@ -12,7 +12,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 if __name__ == "__main__":
-    sys.path[:0] = [str(Path(__file__).resolve().parents[1]), str(Path(__file__).resolve().parents[2])]
+    sys.path[:0] = [
+        str(Path(__file__).resolve().parents[1]),
+        str(Path(__file__).resolve().parents[2]),
+    ]
 
 import numpy as np
 import torch
@@ -57,13 +60,17 @@ class Outcome:
             self.failures += tally.failures
         unsettled = sum(tally.unsettled for tally in self.tallies.values())
         if unsettled > MOST_UNSETTLED * self.checked:
-            self.failures.append(f"{unsettled} of {self.checked} cases: finite differences did not converge")
+            self.failures.append(
+                f"{unsettled} of {self.checked} cases: finite differences did not converge"
+            )
         if not self.image_error < IMAGE_TOLERANCE:
             self.failures.append(f"image: 99.9th percentile {self.image_error:.2e}")
 
     def table(self) -> str:
         names = ("cases", "one-sided", "lively", "unsettled", "twin", "engine")
-        lines = [f"{'class':<16}" + "".join(f"{name:>10}" for name in names) + "  crossed within ±h"]
+        lines = [
+            f"{'class':<16}" + "".join(f"{name:>10}" for name in names) + "  crossed within ±h"
+        ]
         for name, t in self.tallies.items():
             kinds = ", ".join(f"{kind} {count}" for kind, count in t.crossed.most_common())
             lines.append(
@@ -92,7 +99,11 @@ def stress(cases: int, *, first_seed: int = 0, large: int = 4, report: bool = Fa
         outcome.problems += 1
         if report and time.monotonic() - told > 15:
             told = time.monotonic()
-            print(f"{outcome.checked} of {cases} cases, {told - began:.0f} s", file=sys.stderr, flush=True)
+            print(
+                f"{outcome.checked} of {cases} cases, {told - began:.0f} s",
+                file=sys.stderr,
+                flush=True,
+            )
     for seed in range(first_seed, first_seed + large):
         _check_bits(outcome, f"large {seed}", differing(large_problem(seed)))
     outcome.close(errors)
@@ -106,11 +117,14 @@ def _check_bits(outcome: Outcome, label: str, differences: list[str]) -> None:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description="Gradients against finite differences, case by random case.")
+    parser = argparse.ArgumentParser(
+        description="Gradients against finite differences, case by random case."
+    )
     parser.add_argument("--cases", type=int, default=12_000)
     parser.add_argument("--seed", type=int, default=0, help="of the first scene")
     options = parser.parse_args()
-    torch.set_num_threads(1)  # tensors of a few hundred values: more threads only wait for each other
+    # tensors of a few hundred values: more threads only wait for each other
+    torch.set_num_threads(1)
     outcome = stress(options.cases, first_seed=options.seed, large=20, report=True)
     print(outcome.table())
     for failure in outcome.failures:

@@ -39,7 +39,9 @@ class Problem:
 
     def oracle(self, params: Params, *, grad: bool = False) -> tuple[Oracle, list[torch.Tensor]]:
         # A clip is continuous: on its wrong side only the slope is another, hence the narrow margin.
-        return oracle(params, self.cameras, self.settings, self.background, grad=grad, clip_margin=2e-6)
+        return oracle(
+            params, self.cameras, self.settings, self.background, grad=grad, clip_margin=2e-6
+        )
 
     def loss(self, image: torch.Tensor, alpha: torch.Tensor, depth: torch.Tensor) -> torch.Tensor:
         w = torch.from_numpy(self.weights).to(image.dtype)
@@ -48,7 +50,9 @@ class Problem:
     def engine(self) -> tuple[tuple[torch.Tensor, ...], dict[str, NDArray[np.float32]]]:
         """The float32 rasteriser's image, alpha and depth, and its gradients."""
         mine = [torch.from_numpy(self.params[k].copy()).requires_grad_() for k in NAMES]
-        outputs = rasterize(*mine, self.cameras, 0, background=self.background, settings=self.settings)
+        outputs = rasterize(
+            *mine, self.cameras, 0, background=self.background, settings=self.settings
+        )
         self.loss(*outputs).backward()
         found = {k: t.grad.numpy() for k, t in zip(NAMES, mine, strict=True) if t.grad is not None}
         return tuple(t.detach() for t in outputs), found

@@ -94,7 +94,9 @@ def seen_alike(splats: Splats, cameras: Cameras, cells: int) -> tuple[float, flo
 
 
 @pytest.mark.parametrize("offset", [(0.0, 0.0, 0.0), (691234.5, 5334567.25, 512.0)])
-def test_the_papers_policy_makes_nearly_the_same_scene(offset: tuple[float, float, float], gpu: None) -> None:
+def test_the_papers_policy_makes_nearly_the_same_scene(
+    offset: tuple[float, float, float], gpu: None
+) -> None:
     ball = checkered_ball(2000)
     prior = Splats.create(
         ball.means.astype(np.float64) + offset,
@@ -142,7 +144,9 @@ def test_looks_of_the_default_method_run_on_the_gpu(gpu: None) -> None:
     here = visibility_source(views)(ball)
     np.testing.assert_array_equal(there.pixel_size, here.pixel_size)
     assert np.abs(there.weight - here.weight).sum() <= 1e-4 * here.weight.sum()
-    assert_close(made, simplify(ball, 300, visibility=visibility_source(views)), ball, views.take(range(4)))
+    assert_close(
+        made, simplify(ball, 300, visibility=visibility_source(views)), ball, views.take(range(4))
+    )
 
 
 IMAGES = [
@@ -176,7 +180,10 @@ def test_what_the_gpu_does_not_draw_is_the_cpus(gpu: None) -> None:
     made = []
     for device in ("cpu", "gpu"):
         devices.use(device)
-        renderer, inria = Renderer(ball), Renderer(ball, settings=RasterSettings(convention="inria"))
+        renderer, inria = (
+            Renderer(ball),
+            Renderer(ball, settings=RasterSettings(convention="inria")),
+        )
         around_it = renderer.panorama(view, width=32).image
         renderer.image(view)
         rendered = renderer.render(view, median=True)
@@ -188,7 +195,9 @@ def test_what_the_gpu_does_not_draw_is_the_cpus(gpu: None) -> None:
         np.testing.assert_array_equal(here, there)
 
 
-@pytest.mark.parametrize("most", [64, 40_000, 200_000], ids=["to open", "for a scene", "for a view"])
+@pytest.mark.parametrize(
+    "most", [64, 40_000, 200_000], ids=["to open", "for a scene", "for a view"]
+)
 def test_images_are_the_cpus_if_a_gpu_has_no_room(most: int, gpu: None) -> None:
     ball, views = checkered_ball(600), around(3, (160, 120))
     devices.use("cpu")
@@ -248,7 +257,10 @@ def test_commands_say_what_the_gpu_did(
 
 
 def test_failures_are_reported_at_once(capsys: pytest.CaptureFixture, gpu: None) -> None:
-    common = dict.fromkeys(("overwrite", "verbose", "quiet", "json", "config")) | {"seed": 0, "threads": 0}
+    common = dict.fromkeys(("overwrite", "verbose", "quiet", "json", "config")) | {
+        "seed": 0,
+        "threads": 0,
+    }
     run = Run("simplify", {**common, "device": "gpu"}, {})
     _core.set_device("gpu", 64)  # too small for a row
     simplify(checkered_ball(60), 20, method="paper")
@@ -258,7 +270,9 @@ def test_failures_are_reported_at_once(capsys: pytest.CaptureFixture, gpu: None)
     assert "GPU" not in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("most", [64, 40_000, 200_000], ids=["to open", "for a scene", "for a view"])
+@pytest.mark.parametrize(
+    "most", [64, 40_000, 200_000], ids=["to open", "for a scene", "for a view"]
+)
 def test_recovery_continues_on_the_cpu_if_a_gpu_has_no_room(most: int, gpu: None) -> None:
     ball = checkered_ball(300)
     targets, config = TeacherRenders(ball, around(4)), RecoverConfig(steps=5)
@@ -330,7 +344,8 @@ def test_without_an_adapter_one_line_and_the_cpu(
         pytest.skip("this machine's driver is not Vulkan's")
     assert status == 0
     lines = told.splitlines()
-    assert [line for line in lines if "goes on on the CPU" in line] == [lines[0]]  # before the summary
+    # before the summary
+    assert [line for line in lines if "goes on on the CPU" in line] == [lines[0]]
     assert lines[1].startswith("gpu.ply")
     told = succeeds(command_line, tmp_path, *paper, "-o", "cpu.ply", "--device", "auto").err
     assert "GPU" not in told

@@ -24,7 +24,9 @@ def test_features_need_torch(
     targets = g2ard.TeacherRenders(ball, around(4, (32, 24)))
     with pytest.raises(MissingDependencyError, match=r"'torch' needs torch; pip install torch$"):
         g2ard.recover(ball, targets, g2ard.RecoverConfig(steps=1, engine="torch"))
-    with pytest.raises(InputError, match=r"engine: expected one of fused, torch \(the device gpu runs fused"):
+    with pytest.raises(
+        InputError, match=r"engine: expected one of fused, torch \(the device gpu runs fused"
+    ):
         g2ard.RecoverConfig(engine="gsplat")
     with pytest.raises(MissingDependencyError, match=r"^LPIPS needs torch"):
         load_lpips(folder)
@@ -45,13 +47,17 @@ def test_features_need_torch(
 def test_a_checkout_without_its_extension_says_what_to_do(tmp_path: Path) -> None:
     """After `pip install .`, Python run in the checkout finds the sources, which have no extension."""
     for folder in ("g2ard", "benchmarks"):
-        shutil.copytree(ROOT / folder, tmp_path / folder, ignore=shutil.ignore_patterns("_core.*", "record"))
+        shutil.copytree(
+            ROOT / folder, tmp_path / folder, ignore=shutil.ignore_patterns("_core.*", "record")
+        )
     for words in (
         ["-m", "g2ard", "--version"],
         ["-m", "benchmarks", "--help"],
         ["-c", "import g2ard; g2ard.simplify"],
     ):
-        done = subprocess.run([sys.executable, *words], cwd=tmp_path, capture_output=True, text=True)
+        done = subprocess.run(
+            [sys.executable, *words], cwd=tmp_path, capture_output=True, text=True
+        )
         assert done.returncode == 1
         said = done.stderr.splitlines()
         assert f"{tmp_path}: this checkout has no Rust extension" in said[-1]

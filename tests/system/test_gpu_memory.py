@@ -34,6 +34,8 @@ print(peaks[1100] - peaks[100])
 def test_steps_keep_no_memory() -> None:
     skip_without_gpu()
     program, tests = [sys.executable, "-c", _PROGRAM], ROOT / "tests"
-    done = subprocess.run(program, cwd=tests, env=environment(), capture_output=True, text=True, timeout=300)
+    done = subprocess.run(
+        program, cwd=tests, env=environment(), capture_output=True, text=True, timeout=300
+    )
     assert done.returncode == 0, done.stderr
     assert int(done.stdout) < 32e6

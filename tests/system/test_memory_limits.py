@@ -22,12 +22,18 @@ MACHINE = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
             500_000_000,
         ),
         ("4:memory:/of/the/host\n", {"memory/memory.limit_in_bytes": "500000000\n"}, 500_000_000),
-        ("3:cpuset,memory:/x\n", {"memory/x/memory.limit_in_bytes": "9223372036854771712\n"}, MACHINE),
+        (
+            "3:cpuset,memory:/x\n",
+            {"memory/x/memory.limit_in_bytes": "9223372036854771712\n"},
+            MACHINE,
+        ),
         ("2:cpu:/x\n", {"cpu/x/memory.max": "1\n"}, MACHINE),
         ("not a group", {}, MACHINE),
     ],
 )
-def test_the_smallest_limit_counts(groups: str, files: dict[str, str], limit: int, tmp_path: Path) -> None:
+def test_the_smallest_limit_counts(
+    groups: str, files: dict[str, str], limit: int, tmp_path: Path
+) -> None:
     (tmp_path / "proc/self").mkdir(parents=True)
     (tmp_path / "proc/self/cgroup").write_text(groups)
     for name, text in files.items():

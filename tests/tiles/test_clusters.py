@@ -25,7 +25,14 @@ def _tasks(folder: Path) -> list[Task]:
 @pytest.fixture
 def scheduler(tmp_path: Path) -> Iterator[tuple[str, subprocess.Popen[str]]]:
     """A scheduler in a process of its own, without workers."""
-    words = [sys.executable, "-m", "distributed.cli.dask_scheduler", "--port", "0", "--no-dashboard"]
+    words = [
+        sys.executable,
+        "-m",
+        "distributed.cli.dask_scheduler",
+        "--port",
+        "0",
+        "--no-dashboard",
+    ]
     with subprocess.Popen(words, stderr=subprocess.PIPE, text=True, cwd=tmp_path) as running:
         assert running.stderr is not None
         lines = iter(running.stderr.readline, "")

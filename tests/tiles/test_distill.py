@@ -50,27 +50,45 @@ def test_frozen_rows_stay_and_the_others_learn() -> None:
     done = recover(small, TeacherRenders(dense, ring()), config, frozen=frozen)
     assert done.report.psnr.after > done.report.psnr.before
     for name in ("means", "scales", "logit_opacities", "sh0"):
-        was, now = (np.asarray(getattr(s, name), np.float32).reshape(300, -1) for s in (small, done.splats))
+        was, now = (
+            np.asarray(getattr(s, name), np.float32).reshape(300, -1) for s in (small, done.splats)
+        )
         np.testing.assert_allclose(now[frozen], was[frozen], rtol=2e-6, atol=1e-6)
         assert (np.abs(now - was)[~frozen] > 1e-5).any(axis=1).mean() > 0.9
     with pytest.raises(InputError, match=r"frozen: expected shape \(300,\)"):
         recover(small, TeacherRenders(dense, ring()), config, frozen=frozen[:5])
 
 
-def test_simplify_removes_its_tiles(command_line: CommandLine, folder: Path, tmp_path: Path) -> None:
+def test_simplify_removes_its_tiles(
+    command_line: CommandLine, folder: Path, tmp_path: Path
+) -> None:
     out, views = tmp_path / "small_{ratio}x.ply", folder / "views.json"
     args = ["simplify", folder / "town.ply", "-r", "10,20", "-o", out, "--tile-rows", "2500"]
     succeeds(
-        command_line, tmp_path, *args, "--views", views, "--workers", "1", "--json", tmp_path / "told.json"
+        command_line,
+        tmp_path,
+        *args,
+        "--views",
+        views,
+        "--workers",
+        "1",
+        "--json",
+        tmp_path / "told.json",
     )
     told = json.loads((tmp_path / "told.json").read_text())["runs"]
     for ratio, report in zip((10, 20), told, strict=True):
         small = read_splats(tmp_path / f"small_{ratio}x.ply")
         assert len(small) == 9000 // ratio == report["output_count"] == sum(report["tiles"])
-    assert {path.name for path in tmp_path.iterdir()} == {"small_10x.ply", "small_20x.ply", "told.json"}
+    assert {path.name for path in tmp_path.iterdir()} == {
+        "small_10x.ply",
+        "small_20x.ply",
+        "told.json",
+    }
 
 
-def test_files_of_another_run_are_replaced(command_line: CommandLine, folder: Path, tmp_path: Path) -> None:
+def test_files_of_another_run_are_replaced(
+    command_line: CommandLine, folder: Path, tmp_path: Path
+) -> None:
     args = ["-n", "300", "--no-views", "--workers", "1", "--tile-rows", "700"]
     write_splats(tmp_path / "other.ply", town(1500, seed=4))
     write_splats(tmp_path / "own.ply", town(1600))
@@ -85,7 +103,9 @@ def test_files_of_another_run_are_replaced(command_line: CommandLine, folder: Pa
     assert not stale.exists()
 
 
-def test_a_device_that_all_rows_fit(command_line: CommandLine, folder: Path, tmp_path: Path) -> None:
+def test_a_device_that_all_rows_fit(
+    command_line: CommandLine, folder: Path, tmp_path: Path
+) -> None:
     args = ["simplify", folder / "town.ply", "--fit", "web", "-o", "all.ply", "--tile-rows", "2500"]
     succeeds(command_line, tmp_path, *args, "--workers", "1")
     assert len(read_splats(tmp_path / "all.ply")) == 9000
@@ -96,7 +116,19 @@ def test_a_device_that_all_rows_fit(command_line: CommandLine, folder: Path, tmp
     [
         (("simplify", "-o", "small.ply", "--no-views"), "small.ply"),
         (
-            ("distill", "-o", "run", "--sh-degree", 0, "--steps", 2, "--size", 24, "--focus", "far"),
+            (
+                "distill",
+                "-o",
+                "run",
+                "--sh-degree",
+                0,
+                "--steps",
+                2,
+                "--size",
+                24,
+                "--focus",
+                "far",
+            ),
             "run/scene.ply",
         ),
     ],
@@ -113,7 +145,9 @@ def test_tiles_fill_a_file(
     assert size <= 40_000 < size + 2 * size / count
 
 
-def test_a_folder_of_tiles_is_a_scene(command_line: CommandLine, folder: Path, tmp_path: Path) -> None:
+def test_a_folder_of_tiles_is_a_scene(
+    command_line: CommandLine, folder: Path, tmp_path: Path
+) -> None:
     store = ingest(folder / "town.ply", tmp_path / "tiles", tile_rows=2500)
     common = ["-n", "900", "--no-views", "--workers", "1"]
     work = ("--work", tmp_path / "work")
@@ -128,7 +162,9 @@ def test_a_folder_of_tiles_is_a_scene(command_line: CommandLine, folder: Path, t
     assert (tmp_path / "work" / "steps").is_dir()  # named by the user, so it stays
 
 
-def test_tiles_are_read_as_one_scene(command_line: CommandLine, folder: Path, tmp_path: Path) -> None:
+def test_tiles_are_read_as_one_scene(
+    command_line: CommandLine, folder: Path, tmp_path: Path
+) -> None:
     dense = read_splats(folder / "town.ply")
     for rows in (9000, 2500):
         store = ingest(folder / "town.ply", tmp_path / f"{rows}", tile_rows=rows)
@@ -142,12 +178,25 @@ def test_tiles_are_read_as_one_scene(command_line: CommandLine, folder: Path, tm
 
 
 def test_a_killed_command_resumes(folder: Path, tmp_path: Path) -> None:
-    words = ["simplify", folder / "town.ply", "-r", "10", "-o", tmp_path / "x.ply", "--tile-rows", "700"]
+    words = [
+        "simplify",
+        folder / "town.ply",
+        "-r",
+        "10",
+        "-o",
+        tmp_path / "x.ply",
+        "--tile-rows",
+        "700",
+    ]
     command = [sys.executable, "-m", "g2ard", *map(str, words), "--workers", "2", "--no-views"]
     steps = tmp_path / ".x.ply.tiles" / "steps"
     with subprocess.Popen(command, env=environment(), stderr=subprocess.DEVNULL) as running:
         until = time.monotonic() + 120
-        while running.poll() is None and time.monotonic() < until and len(list(steps.glob("[!.]*.npz"))) < 3:
+        while (
+            running.poll() is None
+            and time.monotonic() < until
+            and len(list(steps.glob("[!.]*.npz"))) < 3
+        ):
             time.sleep(0.01)
         running.kill()
     done = {path.name: path.stat().st_mtime_ns for path in steps.glob("[!.]*.npz")}
@@ -161,7 +210,16 @@ def test_a_killed_command_resumes(folder: Path, tmp_path: Path) -> None:
 @needs_proc
 @pytest.mark.parametrize("seconds", [0.0, 0.3])
 def test_workers_end_with_a_killed_command(folder: Path, tmp_path: Path, seconds: float) -> None:
-    words = ["simplify", folder / "town.ply", "-r", "10", "-o", tmp_path / "x.ply", "--tile-rows", "700"]
+    words = [
+        "simplify",
+        folder / "town.ply",
+        "-r",
+        "10",
+        "-o",
+        tmp_path / "x.ply",
+        "--tile-rows",
+        "700",
+    ]
     command = [sys.executable, "-m", "g2ard", *map(str, words), "--workers", "2", "--no-views"]
     with subprocess.Popen(command, env=environment(), stderr=subprocess.DEVNULL) as running:
         until = time.monotonic() + 60
@@ -179,19 +237,25 @@ def test_workers_end_with_a_killed_command(folder: Path, tmp_path: Path, seconds
     assert not left
 
 
-def test_distill_in_one_piece_heeds_memory(command_line: CommandLine, folder: Path, tmp_path: Path) -> None:
+def test_distill_in_one_piece_heeds_memory(
+    command_line: CommandLine, folder: Path, tmp_path: Path
+) -> None:
     call = ("distill", folder / "town.ply", "-r", 10, "-o", "run", "--views", folder / "views.json")
     status, _, said = command_line(*call, "--memory", "120MB", cwd=tmp_path)
     assert status == 1
     said = " ".join(said.split())
-    assert re.search(r"9,000 Gaussians in one piece take about [\d.]+ [MG]B, more than 120 MB", said)
+    assert re.search(
+        r"9,000 Gaussians in one piece take about [\d.]+ [MG]B, more than 120 MB", said
+    )
     assert "in tiles the least that tiles take is about 201 MB, with --tile-rows 1,000" in said
     assert not list(tmp_path.iterdir())
 
 
 def test_more_memory_takes_more_workers(folder: Path, tmp_path: Path) -> None:
     store = ingest(folder / "town.ply", tmp_path / "tiles", tile_rows=2500)
-    few, many = (plan_tiles(store, Tiling(memory=size, cores=64)).workers for size in (10**9, 4 * 10**9))
+    few, many = (
+        plan_tiles(store, Tiling(memory=size, cores=64)).workers for size in (10**9, 4 * 10**9)
+    )
     assert 1 < few < many
 
 
@@ -200,7 +264,11 @@ def test_tiles_draw_the_images_of_the_whole_scene(folder: Path, tmp_path: Path) 
     scene = town(3000)
     scene.scales[::50] *= 30
     write_splats(tmp_path / "town.ply", scene)
-    eyes = [([0.1, 0.2, 0.5], [3, 0.1, 0.3]), ([300, 0, 90], [0, 0, 0]), ([-7, -3, 0.4], [7, 3, 0.4])]
+    eyes = [
+        ([0.1, 0.2, 0.5], [3, 0.1, 0.3]),
+        ([300, 0, 90], [0, 0, 0]),
+        ([-7, -3, 0.4], [7, 3, 0.4]),
+    ]
     far = views_at([look_at(eye, target) for eye, target in eyes], (96, 72), 120)
     views = Cameras.of([*ring(), *far])
     store = ingest(tmp_path / "town.ply", tmp_path / "tiles", tile_rows=500)
@@ -215,14 +283,27 @@ def test_tiles_draw_the_images_of_the_whole_scene(folder: Path, tmp_path: Path) 
             np.testing.assert_allclose(drawn[view], whole[view], atol=1 / 255)
             assert np.abs(drawn[view] - whole[view]).mean() < 2e-5
         small = simplify(scene, 300).splats
-        assert tiles.opacity_lost(small, views) == pytest.approx(opacity_lost(scene, small, views), abs=1e-3)
+        assert tiles.opacity_lost(small, views) == pytest.approx(
+            opacity_lost(scene, small, views), abs=1e-3
+        )
 
 
-def test_a_run_in_tiles_has_all_its_parts(command_line: CommandLine, folder: Path, tmp_path: Path) -> None:
+def test_a_run_in_tiles_has_all_its_parts(
+    command_line: CommandLine, folder: Path, tmp_path: Path
+) -> None:
     succeeds(
         command_line,
         tmp_path,
-        *("distill", folder / "town.ply", "-r", 10, "-o", tmp_path / "run", "--views", folder / "views.json"),
+        *(
+            "distill",
+            folder / "town.ply",
+            "-r",
+            10,
+            "-o",
+            tmp_path / "run",
+            "--views",
+            folder / "views.json",
+        ),
         *("--tile-rows", 4000, "--steps", 60, "--size", 120, "--workers", 1, "--keep"),
     )
     report = json.loads((tmp_path / "run" / "report.json").read_text())
@@ -232,7 +313,9 @@ def test_a_run_in_tiles_has_all_its_parts(command_line: CommandLine, folder: Pat
     small = read_splats(tmp_path / "run" / "scene.ply")
     assert len(small) == len(read_splats(tmp_path / "run" / "simplified" / "scene.ply")) == 900
     assert set(report["inputs"]) == {str(folder / "town.ply"), str(folder / "views.json")}
-    held_out = TeacherRenders(read_splats(folder / "town.ply"), ring(8).take([6, 7])).cameras.fitted(120)
+    held_out = TeacherRenders(
+        read_splats(folder / "town.ply"), ring(8).take([6, 7])
+    ).cameras.fitted(120)
     against = TeacherRenders(read_splats(folder / "town.ply"), held_out)
     assert evaluate(small, against).psnr == pytest.approx(scores["recovered"], abs=0.02)
     names = {path.name for path in (tmp_path / "run").iterdir()}
@@ -256,7 +339,15 @@ def test_options_work_at_any_size(
     options: tuple[object, ...], command_line: CommandLine, folder: Path, tmp_path: Path
 ) -> None:
     timed = {"--time", "--recovery-time"} & set(options)
-    call = ("distill", folder / "town.ply", "--views", folder / "views.json", "--size", 64, "--no-page")
+    call = (
+        "distill",
+        folder / "town.ply",
+        "--views",
+        folder / "views.json",
+        "--size",
+        64,
+        "--no-page",
+    )
     steps = () if timed else ("--steps", 4)
     rows = ("--tile-rows", 4000, "--workers", 1)
     succeeds(command_line, tmp_path, *call, *rows, *steps, *options, "-o", "run")
@@ -273,7 +364,18 @@ def test_a_cloud_streams_into_tiles(command_line: CommandLine, tmp_path: Path) -
     rows = ("--tile-rows", 1000, "--workers", 1)
     succeeds(command_line, tmp_path, "simplify", "cloud.ply", "-n", 300, "-o", "small.ply", *rows)
     assert len(read_splats(tmp_path / "small.ply")) == 300
-    succeeds(command_line, tmp_path, "lod", "cloud.ply", "-r", "2,8", "--merge-only", "-o", "levels", *rows)
+    succeeds(
+        command_line,
+        tmp_path,
+        "lod",
+        "cloud.ply",
+        "-r",
+        "2,8",
+        "--merge-only",
+        "-o",
+        "levels",
+        *rows,
+    )
     distilled = ("distill", "cloud.ply", "-n", 300, "--steps", 4, "--size", 64, "--no-page")
     succeeds(command_line, tmp_path, *distilled, *rows, "-o", "run")
     report = json.loads((tmp_path / "run" / "report.json").read_text())
@@ -281,13 +383,27 @@ def test_a_cloud_streams_into_tiles(command_line: CommandLine, tmp_path: Path) -
     (tmp_path / "images").mkdir()
     pictured = photographed(tmp_path / "images", scene, ring(8))
     write_views(tmp_path / "pictured.json", pictured, splits=["train"] * 6 + ["test"] * 2)
-    succeeds(command_line, tmp_path, *distilled, "--views", "pictured.json", *rows, "-o", "photographed")
+    succeeds(
+        command_line, tmp_path, *distilled, "--views", "pictured.json", *rows, "-o", "photographed"
+    )
     report = json.loads((tmp_path / "photographed" / "report.json").read_text())
     assert (report["against"], report["tiles"]) == ("photos", 3)
 
 
-def test_tiles_make_a_folder_of_sog(command_line: CommandLine, folder: Path, tmp_path: Path) -> None:
-    call = "simplify", folder / "town.ply", "-r", "10", "--tile-rows", "2500", "--workers", "1", "--no-views"
+def test_tiles_make_a_folder_of_sog(
+    command_line: CommandLine, folder: Path, tmp_path: Path
+) -> None:
+    call = (
+        "simplify",
+        folder / "town.ply",
+        "-r",
+        "10",
+        "--tile-rows",
+        "2500",
+        "--workers",
+        "1",
+        "--no-views",
+    )
     succeeds(command_line, tmp_path, *call, "-o", "small/meta.json")
     assert len(read_splats(tmp_path / "small" / "meta.json")) == 900
     assert not list(tmp_path.glob(".*"))

@@ -32,7 +32,9 @@ def scheduler(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     distributed = pytest.importorskip("distributed")
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(tmp_path_factory.mktemp("elsewhere"))
-        cluster = distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None)
+        cluster = distributed.LocalCluster(
+            n_workers=2, threads_per_worker=1, dashboard_address=None
+        )
     yield cluster.scheduler_address
     cluster.close()
 
@@ -52,8 +54,12 @@ def test_relative_paths_are_the_clients(
         call = (*CALLS[name].split(), *work, "--views", "views.json", "--tile-rows", "700")
         succeeds(command_line, tmp_path, *(word.replace("OUT", out) for word in call), *where)
         made = files_of(tmp_path / out)
-        files.append({path: digest for path, digest in made.items() if Path(path).name not in NAMED})
-    scenes, others = ({path: digest for path, digest in made.items() if "work" not in path} for made in files)
+        files.append(
+            {path: digest for path, digest in made.items() if Path(path).name not in NAMED}
+        )
+    scenes, others = (
+        {path: digest for path, digest in made.items() if "work" not in path} for made in files
+    )
     assert scenes == others
 
 

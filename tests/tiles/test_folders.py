@@ -40,10 +40,15 @@ def test_a_folder_has_one_live_owner(tmp_path: Path) -> None:
         "import sys, time; from pathlib import Path; from g2ard.io.lock import locked\n"
         "with locked(Path(sys.argv[1])): print('held', flush=True); time.sleep(60)"
     )
-    with subprocess.Popen([sys.executable, "-c", holds, tmp_path], stdout=subprocess.PIPE) as holder:
+    with subprocess.Popen(
+        [sys.executable, "-c", holds, tmp_path], stdout=subprocess.PIPE
+    ) as holder:
         try:
             assert holder.stdout.readline().strip() == b"held"
-            with pytest.raises(OutputError, match=f"in use by process {holder.pid};"), locked(tmp_path):
+            with (
+                pytest.raises(OutputError, match=f"in use by process {holder.pid};"),
+                locked(tmp_path),
+            ):
                 pass
             assert (tmp_path / LOCK).exists()  # the holder's, not taken by who was refused
         finally:
@@ -85,7 +90,8 @@ def test_tiles_of_another_length_are_poured_again(place: Path, tmp_path: Path, l
     assert "damaged" in said[0]
     with (folder / "tile-00000.f32").open("r+b") as file:
         file.truncate(length)
-    with pytest.raises(InputError, match="the manifest says"):  # of other settings it is not replaced unasked
+    # of other settings it is not replaced unasked
+    with pytest.raises(InputError, match="the manifest says"):
         ingest(place / "town.ply", folder, tile_rows=800)
 
 
@@ -101,8 +107,14 @@ def test_damaged_tiles_are_written_again_on_request(
     assert "skipped" in succeeds(command_line, tmp_path, *words).err
     assert "1 tile damaged" in succeeds(command_line, tmp_path, *words, "-w").err
     assert files_of(tmp_path / "tiles") == before
-    written = {path for path, then in times.items() if (tmp_path / "tiles" / path).stat().st_mtime_ns != then}
-    assert written == {name.replace("tile-", kind).replace("halo-", kind) for kind in ("tile-", "halo-")}
+    written = {
+        path
+        for path, then in times.items()
+        if (tmp_path / "tiles" / path).stat().st_mtime_ns != then
+    }
+    assert written == {
+        name.replace("tile-", kind).replace("halo-", kind) for kind in ("tile-", "halo-")
+    }
 
 
 def test_damaged_tiles_of_a_work_folder_are_written_again_on_request(
@@ -199,7 +211,9 @@ def test_invalid_options_are_rejected_before_any_work(
     assert not list(tmp_path.iterdir())
 
 
-def test_errors_leave_no_copy_of_the_scene(command_line: CommandLine, place: Path, tmp_path: Path) -> None:
+def test_errors_leave_no_copy_of_the_scene(
+    command_line: CommandLine, place: Path, tmp_path: Path
+) -> None:
     tiled = ("simplify", place / "town.ply", *BLIND, "-o", "a.ply", "-n")
     status, _, said = command_line(*tiled, 9999, cwd=tmp_path)
     assert status == 1, said
@@ -232,7 +246,9 @@ def test_work_rejects_a_folder_with_other_files(
         succeeds(command_line, tmp_path, *tiled, "-o", "a.ply", "-w", "--work", "work")
 
 
-def test_an_unfinished_ingest_is_named(command_line: CommandLine, place: Path, tmp_path: Path) -> None:
+def test_an_unfinished_ingest_is_named(
+    command_line: CommandLine, place: Path, tmp_path: Path
+) -> None:
     (tmp_path / "begun").mkdir()
     (tmp_path / "begun" / "tile-00000.f32").write_bytes(b"")
     for call in (("info", "begun"), ("simplify", "begun", "-n", 300, "-o", "a.ply")):
@@ -243,18 +259,27 @@ def test_an_unfinished_ingest_is_named(command_line: CommandLine, place: Path, t
     assert "tiles.json" in command_line("info", "empty", cwd=tmp_path)[2]
 
 
-def test_tiles_are_not_too_many(place: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_tiles_are_not_too_many(
+    place: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(ingest_module, "MOST_TILES", 10)
-    with pytest.raises(InputError, match="1,600 rows are too many for tiles of 159; use at least 160"):
+    with pytest.raises(
+        InputError, match="1,600 rows are too many for tiles of 159; use at least 160"
+    ):
         ingest(place / "town.ply", tmp_path / "tiles", tile_rows=159)
     assert not (tmp_path / "tiles").exists()
     assert ingest(place / "town.ply", tmp_path / "tiles", tile_rows=160).count == 1600
 
 
-def test_rows_of_tiles_that_lie_in_a_folder_are_theirs(command_line: CommandLine, place: Path) -> None:
+def test_rows_of_tiles_that_lie_in_a_folder_are_theirs(
+    command_line: CommandLine, place: Path
+) -> None:
     ask = ("simplify", "tiles", "-r", "10", "-o", "x.ply", "--tile-rows")
     told = refused(command_line, place, *ask, "1k")
-    assert "--tile-rows: tiles already has tiles of 700; to change them, run `g2ard ingest tiles" in told
+    assert (
+        "--tile-rows: tiles already has tiles of 700; to change them, run `g2ard ingest tiles"
+        in told
+    )
     ask = (*ask, "700", "--dry-run")
     succeeds(command_line, place, *ask)  # the same rows are no other
 

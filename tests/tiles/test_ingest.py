@@ -38,7 +38,9 @@ def test_every_row_is_in_one_tile(tmp_path: Path, degree: int, offset: tuple[flo
         part = store.read(tile.index)
         np.testing.assert_array_equal(part.offset, whole.splats.offset)
         np.testing.assert_array_equal(part.means, store.rows(tile.index)[:, :3])
-        assert all(getattr(part, n).flags.c_contiguous for n in ("means", "quats", "scales", "sh0", "shN"))
+        assert all(
+            getattr(part, n).flags.c_contiguous for n in ("means", "quats", "scales", "sh0", "shN")
+        )
         assert (part.means >= np.float32(tile.low)).all()
         assert (part.means <= np.float32(tile.high)).all()
 
@@ -88,7 +90,9 @@ def test_bad_rows_are_treated_as_by_the_reader(tmp_path: Path) -> None:
 def test_other_encodings(tmp_path: Path, options: dict[str, object]) -> None:
     far = 5_427_319.25 if "dtype" in options else 0  # what float32 cannot hold is recentred
     properties = columns(town(600))
-    source = save(tmp_path / "odd.ply", properties | {"y": properties["y"] + np.float64(far)}, **options)
+    source = save(
+        tmp_path / "odd.ply", properties | {"y": properties["y"] + np.float64(far)}, **options
+    )
     whole = read_scene(source).splats
     store = ingest(source, tmp_path / "tiles", tile_rows=200, block_rows=47)
     assert whole.offset.any() == bool(far)
@@ -99,7 +103,9 @@ def test_other_encodings(tmp_path: Path, options: dict[str, object]) -> None:
 def test_neither_blocks_nor_order_decide(tmp_path: Path) -> None:
     scene = town(degree=1)
     source = saved(tmp_path / "town.ply", scene)
-    shuffled = saved(tmp_path / "mixed.ply", scene.take(np.random.default_rng(1).permutation(len(scene))))
+    shuffled = saved(
+        tmp_path / "mixed.ply", scene.take(np.random.default_rng(1).permutation(len(scene)))
+    )
     first = ingest(source, tmp_path / "a", tile_rows=500, block_rows=6000)
     for name, path, rows in (("b", source, 64), ("c", source, 4999), ("d", shuffled, 1000)):
         store = ingest(path, tmp_path / name, tile_rows=500, block_rows=rows)
@@ -111,11 +117,15 @@ def test_neither_blocks_nor_order_decide(tmp_path: Path) -> None:
         assert_same_sets(halos_of(store), halos_of(first))
 
 
-def test_a_sample_does_not_depend_on_the_order(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_sample_does_not_depend_on_the_order(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("g2ard.tiles.writer._TREE_SAMPLE", 400)
     scene = town(20_000)
     source = saved(tmp_path / "town.ply", scene)
-    mixed = saved(tmp_path / "mixed.ply", scene.take(np.random.default_rng(1).permutation(len(scene))))
+    mixed = saved(
+        tmp_path / "mixed.ply", scene.take(np.random.default_rng(1).permutation(len(scene)))
+    )
     said: list[str] = []
     first = ingest(source, tmp_path / "a", tile_rows=2000, block_rows=5000, say=said.append)
     assert len(first.tiles) < 30  # the sample's uncertainty costs tiles, but not many
@@ -126,7 +136,9 @@ def test_a_sample_does_not_depend_on_the_order(tmp_path: Path, monkeypatch: pyte
     assert_same_sets(halos_of(first), halos_of(second))
 
 
-def test_overfull_tiles_of_a_sample_are_split(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_overfull_tiles_of_a_sample_are_split(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("g2ard.tiles.writer._TREE_SAMPLE", 60)
     monkeypatch.setattr("g2ard.scene.kdtree._SAMPLE_SIGMAS", 0.0)
     source = saved(tmp_path / "town.ply", town(20_000))
@@ -216,7 +228,11 @@ def test_foreign_folders_are_not_touched(tmp_path: Path) -> None:
 def test_damage_is_named(tmp_path: Path) -> None:
     folder = tmp_path / "tiles"
     ingest(saved(tmp_path / "town.ply", town()), folder, tile_rows=2000)
-    path, halo, manifest = folder / "tile-00001.f32", folder / "halo-00000.f32", folder / "tiles.json"
+    path, halo, manifest = (
+        folder / "tile-00001.f32",
+        folder / "halo-00000.f32",
+        folder / "tiles.json",
+    )
     whole, text = path.read_bytes(), manifest.read_text()
 
     path.write_bytes(whole[:100] + bytes([whole[100] ^ 1]) + whole[101:])
@@ -226,7 +242,9 @@ def test_damage_is_named(tmp_path: Path) -> None:
         store.read(1)
     path.write_bytes(whole[:-8])
     for act in (lambda: TileStore.open(folder), lambda: store.read(1), lambda: store.rows(1)):
-        with pytest.raises(InputError, match=r"tile-00001\.f32: [\d,]+ bytes, but the manifest says"):
+        with pytest.raises(
+            InputError, match=r"tile-00001\.f32: [\d,]+ bytes, but the manifest says"
+        ):
             act()
     path.write_bytes(whole)
     halo.unlink()
@@ -249,7 +267,9 @@ def test_nothing_finite_leaves_nothing(tmp_path: Path) -> None:
     assert not (tmp_path / "tiles").exists()
 
 
-def test_too_little_disk_space_is_reported_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_too_little_disk_space_is_reported_first(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
 
     source = saved(tmp_path / "town.ply", town())
     monkeypatch.setattr("shutil.disk_usage", lambda path: SimpleNamespace(free=300_000))
@@ -260,7 +280,9 @@ def test_too_little_disk_space_is_reported_first(tmp_path: Path, monkeypatch: py
 def test_an_ingest_that_has_done_nothing_leaves_nothing(tmp_path: Path) -> None:
     source = saved(tmp_path / "town.ply", town())
     with pytest.raises(KeyboardInterrupt):
-        ingest(source, tmp_path / "deep" / "tiles", tile_rows=900, progress=interrupt_at("sample", 0))
+        ingest(
+            source, tmp_path / "deep" / "tiles", tile_rows=900, progress=interrupt_at("sample", 0)
+        )
     assert [path.name for path in tmp_path.iterdir()] == ["town.ply"]
 
 
@@ -281,13 +303,23 @@ if __name__ == "__main__":
 
 @pytest.mark.parametrize(("stage", "workers"), [("sample", 1), ("tiles", 2), ("write", 1)])
 def test_a_killed_ingest_continues(tmp_path: Path, stage: str, workers: int) -> None:
-    source, folder, script = saved(tmp_path / "town.ply", town()), tmp_path / "tiles", tmp_path / "killed.py"
+    source, folder, script = (
+        saved(tmp_path / "town.ply", town()),
+        tmp_path / "tiles",
+        tmp_path / "killed.py",
+    )
     whole = ingest(source, tmp_path / "whole", tile_rows=900)
     script.write_text(KILLED)
     words = [sys.executable, script, source, folder, stage, str(workers)]
     assert subprocess.run(words, check=False).returncode == 9
     told = list[tuple[str, int]]()
-    ingest(source, folder, tile_rows=900, block_rows=500, progress=lambda *words: told.append(words[:2]))
+    ingest(
+        source,
+        folder,
+        tile_rows=900,
+        block_rows=500,
+        progress=lambda *words: told.append(words[:2]),
+    )
     assert next(done for name, done in told if name == stage) >= 2500
     assert files_of(folder) == files_of(whole.folder)
 

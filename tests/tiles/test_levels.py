@@ -69,7 +69,9 @@ def test_levels_on_disk_give_the_files_of_levels_in_memory(tmp_path: Path, degre
     stored = []
     for number, count in enumerate((3000, 700)):
         shN = rng.normal(size=(count, (degree + 1) ** 2 - 1, 3))
-        scene = Splats.create(rng.normal(size=(count, 3)), scales=rng.uniform(0.02, 0.1, (count, 3)), shN=shN)
+        scene = Splats.create(
+            rng.normal(size=(count, 3)), scales=rng.uniform(0.02, 0.1, (count, 3)), shN=shN
+        )
         io.write_splats(tmp_path / f"{number}.ply", scene)
         stored.append(ingest(tmp_path / f"{number}.ply", tmp_path / f"{number}", tile_rows=800))
     held = [Splats(**vars(level.take(np.arange(len(level))))) for level in stored]
@@ -80,8 +82,19 @@ def test_levels_on_disk_give_the_files_of_levels_in_memory(tmp_path: Path, degre
 
 
 def levels_in_tiles(place: Path, folder: Path, say: Say = unsaid) -> Levels[Any]:
-    options: dict[str, Any] = {"ratios": (1, 3, 12), "recover": True, "steps": 30, "background": (0, 0, 0)}
-    options |= {"split_sky": False, "seed": 0, "views": place / "views.json", "size": 64, "say": say}
+    options: dict[str, Any] = {
+        "ratios": (1, 3, 12),
+        "recover": True,
+        "steps": 30,
+        "background": (0, 0, 0),
+    }
+    options |= {
+        "split_sky": False,
+        "seed": 0,
+        "views": place / "views.json",
+        "size": 64,
+        "say": say,
+    }
     tiling = Tiling(tile_rows=850, workers=1, folder=folder)
     with open_levels(Source(place / "town.ply"), tiling, **options) as job:
         return job.run()
@@ -116,7 +129,17 @@ def test_levels_have_exact_counts_and_a_stopped_chain_goes_on(place: Path, tmp_p
 
 
 def test_the_command_in_tiles(place: Path, tmp_path: Path, command_line) -> None:
-    given = ["lod", place / "town.ply", "-o", "out", "-r", "1,4,16", "--merge-only", "--chunk-count", "1"]
+    given = [
+        "lod",
+        place / "town.ply",
+        "-o",
+        "out",
+        "-r",
+        "1,4,16",
+        "--merge-only",
+        "--chunk-count",
+        "1",
+    ]
     tiled = [*given, "--tile-rows", "850", "--views", place / "views.json"]
     succeeds(command_line, tmp_path, *tiled, "--workers", "2", "--json", "told.json")
     told = json.loads((tmp_path / "told.json").read_text())
@@ -126,14 +149,20 @@ def test_the_command_in_tiles(place: Path, tmp_path: Path, command_line) -> None
     meta = json.loads((tmp_path / "out" / "lod-meta.json").read_text())
     files = [sog.Stream(tmp_path / "out" / name).whole() for name in meta["filenames"]]
     levels = [name.split("_")[0] for name in meta["filenames"]]
-    counts = {at: sum(len(f) for f, of in zip(files, levels, strict=True) if of == at) for at in "012"}
+    counts = {
+        at: sum(len(f) for f, of in zip(files, levels, strict=True) if of == at) for at in "012"
+    }
     assert counts == {"0": 3000, "1": 750, "2": 188}
     assert len(io.read_splats(tmp_path / "out")) == 3000
     assert {path.name for path in tmp_path.iterdir()} == {"out", "told.json"}
     assert "already finished" in succeeds(command_line, tmp_path, *tiled, "--resume").err
     (tmp_path / ".z.tiles" / "steps").mkdir(parents=True)
-    (tmp_path / ".z.tiles" / "steps" / "coarse-00000-0123456789abcdef.npz").write_bytes(b"of another run")
-    status, _, said = command_line(*tiled[:3], "z", *tiled[4:], "--resume", "--workers", "1", cwd=tmp_path)
+    (tmp_path / ".z.tiles" / "steps" / "coarse-00000-0123456789abcdef.npz").write_bytes(
+        b"of another run"
+    )
+    status, _, said = command_line(
+        *tiled[:3], "z", *tiled[4:], "--resume", "--workers", "1", cwd=tmp_path
+    )
     assert (status, "starting over" in said) == (0, False), said
     assert files_of(tmp_path / "z") == files_of(tmp_path / "out")  # one worker or two
     assert not (tmp_path / ".z.tiles").exists()

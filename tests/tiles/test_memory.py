@@ -48,9 +48,13 @@ def test_tiles_that_are_advised_fit(scene: Path, tmp_path: Path, memory: str) ->
         check_whole_memory(Source(scene), Tiling(memory=size), LEVELS_TIMES, RECOVERY_TIMES)
     store = tiles(scene, tmp_path / "a", advised(str(e.value)))
     assert len(store.tiles) > 1
-    assert plan_tiles(store, Tiling(memory=size, folder=tmp_path / "a"), RECOVERY_TIMES).workers == 1
+    assert (
+        plan_tiles(store, Tiling(memory=size, folder=tmp_path / "a"), RECOVERY_TIMES).workers == 1
+    )
     store = tiles(scene, tmp_path / "b", 11_000)
-    with pytest.raises(InputError, match=r"a tile of [\d,]+ Gaussians and [\d,]+ around it takes about") as e:
+    with pytest.raises(
+        InputError, match=r"a tile of [\d,]+ Gaussians and [\d,]+ around it takes about"
+    ) as e:
         plan_tiles(store, Tiling(memory=size, folder=tmp_path / "b"), RECOVERY_TIMES).workers
     again = tiles(scene, tmp_path / "c", advised(str(e.value)))
     assert plan_tiles(again, Tiling(memory=size), RECOVERY_TIMES).workers == 1
@@ -59,20 +63,33 @@ def test_tiles_that_are_advised_fit(scene: Path, tmp_path: Path, memory: str) ->
 def test_an_error_names_the_least_memory_that_works(scene: Path, tmp_path: Path) -> None:
     store = tiles(scene, tmp_path / "a", 6000)
     for refuse in (
-        lambda: check_whole_memory(Source(scene), Tiling(memory=200_000_000), LEVELS_TIMES, RECOVERY_TIMES),
-        lambda: plan_tiles(store, Tiling(memory=200_000_000, folder=tmp_path / "a"), RECOVERY_TIMES).workers,
+        lambda: check_whole_memory(
+            Source(scene), Tiling(memory=200_000_000), LEVELS_TIMES, RECOVERY_TIMES
+        ),
+        lambda: (
+            plan_tiles(
+                store, Tiling(memory=200_000_000, folder=tmp_path / "a"), RECOVERY_TIMES
+            ).workers
+        ),
     ):
-        with pytest.raises(InputError, match="more than --memory 200 MB; the least that tiles take is") as e:
+        with pytest.raises(
+            InputError, match="more than --memory 200 MB; the least that tiles take is"
+        ) as e:
             refuse()
         told = re.search(r"tiles take is about (\d+) MB, with --tile-rows 1,000$", str(e.value))
         assert told, e.value
         least = tiles(scene, tmp_path / told[1], 1000)
-        assert plan_tiles(least, Tiling(memory=parse_bytes(f"{told[1]}MB")), RECOVERY_TIMES).workers == 1
+        assert (
+            plan_tiles(least, Tiling(memory=parse_bytes(f"{told[1]}MB")), RECOVERY_TIMES).workers
+            == 1
+        )
 
 
 def test_tiles_of_a_folder_are_not_cut_anew(scene: Path, tmp_path: Path) -> None:
     store = tiles(scene, tmp_path, 6000)
-    with pytest.raises(InputError, match=r"; `g2ard ingest \S+tiles -o DIR --tile-rows [\d,]+` takes less"):
+    with pytest.raises(
+        InputError, match=r"; `g2ard ingest \S+tiles -o DIR --tile-rows [\d,]+` takes less"
+    ):
         plan_tiles(store, Tiling(memory=parse_bytes("202MB"), folder=tmp_path / ".x.tiles"))
 
 

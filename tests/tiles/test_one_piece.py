@@ -43,7 +43,9 @@ UNCOUNTED = {".skipped.sh_bands"}
 """Values that reports of tiles do not count."""
 
 
-def both(command_line: CommandLine, folder: Path, *call: object, output: str) -> list[dict[str, Any]]:
+def both(
+    command_line: CommandLine, folder: Path, *call: object, output: str
+) -> list[dict[str, Any]]:
     """Run a command in one piece and in tiles, and return the report of each."""
     reports = []
     for way, options in WAYS.items():
@@ -70,7 +72,9 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     dense = g2ard.load(folder / "landscape.ply")
     colors = np.clip(0.5 + 0.28 * dense.sh0[:, 0], 0, 1)
     write_points(folder / "cloud.ply", Points(dense.means.astype(float), colors))
-    save(folder / "bare.ply", dict(zip("xyz", dense.means.T.astype(float), strict=True)), dtype="f8")
+    save(
+        folder / "bare.ply", dict(zip("xyz", dense.means.T.astype(float), strict=True)), dtype="f8"
+    )
     views, splits = ring(16), ["train"] * 12 + ["test"] * 4
     g2ard.save_views(folder / "views.json", views, splits=splits)
     g2ard.save_views(folder / "photos.json", photographed(folder, dense, views), splits=splits)
@@ -113,7 +117,9 @@ def test_every_method_works_in_tiles(
     folder = shutil.copytree(inputs, tmp_path / "there")
     dense = g2ard.load(folder / "landscape.ply")
     targets = TeacherRenders(dense, g2ard.make_pool(dense, 12, size=(120, 90)))
-    both(command_line, folder, "simplify", "landscape.ply", "-n", 200, *METHODS[name], output=".ply")
+    both(
+        command_line, folder, "simplify", "landscape.ply", "-n", 200, *METHODS[name], output=".ply"
+    )
     small = [g2ard.load(folder / f"{way}.ply") for way in WAYS]
     assert [len(each) for each in small] == [200, 200]
     scores = [g2ard.evaluate(each, targets).psnr for each in small]
@@ -123,13 +129,24 @@ def test_every_method_works_in_tiles(
 def test_rounds_begin_where_memory_holds_them(
     inputs: Path, command_line: CommandLine, tmp_path: Path
 ) -> None:
-    call = ("distill", inputs / "object.ply", "-n", 300, "--preset", "paper", "--size", 64, "--no-page")
+    call = (
+        "distill",
+        inputs / "object.ply",
+        "-n",
+        300,
+        "--preset",
+        "paper",
+        "--size",
+        64,
+        "--no-page",
+    )
     few = ("--set", "recover.schedule.round_steps=5", "--steps", 10)
     one, other = both(command_line, tmp_path, *call, *few, output="")
     counts, tiled = ([entry["count"] for entry in report["rounds"]] for report in (one, other))
     assert tiled == [count for count in counts if count <= 700]
     assert len(tiled) > 1
-    assert other["rounds"][1]["simplify"]["protected"] > 0  # flags of the tiles reach the next round
+    # flags of the tiles reach the next round
+    assert other["rounds"][1]["simplify"]["protected"] > 0
     psnr = [report["scores"]["recovered"]["psnr"] for report in (one, other)]
     assert psnr[1] > psnr[0] - _LOST_BY_FEW, psnr
 
@@ -141,7 +158,18 @@ def test_clutter_is_removed_alike(inputs: Path, command_line: CommandLine, tmp_p
     some = dense.take(rng.integers(0, 2000, 400))
     dust = replace(some, scales=some.scales / 50, logit_opacities=np.full(400, -4.0, np.float32))
     g2ard.save(tmp_path / "cluttered.ply", join([dense, giant, dust]))
-    call = ("distill", "cluttered.ply", "-n", 300, "--clean", "--steps", 10, "--size", 64, "--no-page")
+    call = (
+        "distill",
+        "cluttered.ply",
+        "-n",
+        300,
+        "--clean",
+        "--steps",
+        10,
+        "--size",
+        64,
+        "--no-page",
+    )
     given = ("--views", inputs / "views.json", "--focus", "far")
     one, other = both(command_line, tmp_path, *call, *given, output="")
     for kind, count in one["cleaned"].items():
@@ -164,14 +192,27 @@ def test_parents_are_of_the_rows_of_the_file(
     if tiles:
         source = ingest(source, tmp_path / "tiles", tile_rows=700).folder
     rows = g2ard.load(source)
-    call = ("simplify", source, "-n", 200, "--no-views", "--parents", "parents.npy", *WAYS["tiles"][2:])
+    call = (
+        "simplify",
+        source,
+        "-n",
+        200,
+        "--no-views",
+        "--parents",
+        "parents.npy",
+        *WAYS["tiles"][2:],
+    )
     most = () if tiles else WAYS["tiles"][:2]
     succeeds(command_line, tmp_path, *call, *most, "-o", "small.ply")
     small, parents = g2ard.load(tmp_path / "small.ply"), np.load(tmp_path / "parents.npy")
     assert parents.shape == (len(rows),)
     assert set(parents) - {-1} == set(range(200))
     away = np.linalg.norm(rows.means - small.means[parents], axis=1)[parents >= 0]
-    assert np.median(away) < 0.6 < np.median(np.linalg.norm(rows.means - small.means[::-1][parents], axis=1))
+    assert (
+        np.median(away)
+        < 0.6
+        < np.median(np.linalg.norm(rows.means - small.means[::-1][parents], axis=1))
+    )
 
 
 INPUTS = {
@@ -185,14 +226,25 @@ INPUTS = {
 
 
 @pytest.mark.parametrize("name", INPUTS)
-def test_runs_have_the_same_parts(name: str, inputs: Path, command_line: CommandLine, tmp_path: Path) -> None:
+def test_runs_have_the_same_parts(
+    name: str, inputs: Path, command_line: CommandLine, tmp_path: Path
+) -> None:
     """Views of as many kinds, each weighing as much: as usual ones, others cost 1.5 dB."""
     folder = shutil.copytree(inputs, tmp_path / "there")
     call = ("distill", *INPUTS[name], "-r", 10, "--steps", 30, "--size", 64, "--no-page", "--keep")
     one, other = both(command_line, folder, *call, output="")
     assert keys(other) - keys(one) == {".tiles", ".peak_rss_bytes", ".rounds[].simplify.tiles"}
     assert keys(one) - keys(other) == {f".rounds[].simplify{key}" for key in UNCOUNTED}
-    for key in ("against", "size", "lifted", "preset", "photos", "cleaned", "input_count", "output_count"):
+    for key in (
+        "against",
+        "size",
+        "lifted",
+        "preset",
+        "photos",
+        "cleaned",
+        "input_count",
+        "output_count",
+    ):
         assert one[key] == other[key], key
     assert [kind["kind"] for kind in one["kinds"]] == [kind["kind"] for kind in other["kinds"]]
     views, tiled = (read_view_set(folder / way / "views.json") for way in WAYS)
@@ -201,9 +253,15 @@ def test_runs_have_the_same_parts(name: str, inputs: Path, command_line: Command
     for key, count in counts[0].items():
         assert abs(counts[1][key] - count) <= 0.1 * count + 2, counts
     shown = g2ard.load(folder / "object.ply" if name == "object" else folder / "landscape.ply")
-    shown = shown if name != "cloud" else g2ard.lift(*vars(g2ard.load_points(folder / "cloud.ply")).values())
+    shown = (
+        shown
+        if name != "cloud"
+        else g2ard.lift(*vars(g2ard.load_points(folder / "cloud.ply")).values())
+    )
     bare = replace(views.cameras, image_paths=())
-    targets = TeacherRenders(shown, bare.take([i for i, split in enumerate(views.splits) if split == "test"]))
+    targets = TeacherRenders(
+        shown, bare.take([i for i, split in enumerate(views.splits) if split == "test"])
+    )
     least: list[float] = []
     for file in ("simplified/scene.ply", "scene.ply"):
         scores = [g2ard.evaluate(g2ard.load(folder / way / file), targets).psnr for way in WAYS]
@@ -211,7 +269,9 @@ def test_runs_have_the_same_parts(name: str, inputs: Path, command_line: Command
         assert scores[1] > min(least) - _LOST_BY_FEW, scores
 
 
-def test_points_without_colours_need_photos(inputs: Path, command_line: CommandLine, tmp_path: Path) -> None:
+def test_points_without_colours_need_photos(
+    inputs: Path, command_line: CommandLine, tmp_path: Path
+) -> None:
     for command, output in (("simplify", "out.ply"), ("distill", "out")):
         call = (command, inputs / "bare.ply", "-n", 200, *WAYS["tiles"], "-o", output)
         told = refused(command_line, tmp_path, *call, status=1)

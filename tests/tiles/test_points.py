@@ -36,7 +36,8 @@ def streets(count: int = 8000, seed: int = 0, offset: tuple[float, ...] = (0, 0,
     at[wall == 0] = np.stack([at[:, 0], np.full(count, 25.0), height], 1)[wall == 0]
     at[wall == 1] = np.stack([np.full(count, 60.0), at[:, 1], height], 1)[wall == 1]
     return Points(
-        at + rng.normal(0, 0.01, (count, 3)) + offset, rng.uniform(0, 1, (count, 3)).astype(np.float32)
+        at + rng.normal(0, 0.01, (count, 3)) + offset,
+        rng.uniform(0, 1, (count, 3)).astype(np.float32),
     )
 
 
@@ -61,7 +62,9 @@ def test_blocks_are_the_cloud(tmp_path: Path, name: str) -> None:
     for rows, start in ((100_000, 0), (700, 0), (64, 2990)):
         stream = stream_of(path)
         blocks = list(stream.blocks(rows, start))
-        np.testing.assert_array_equal(np.concatenate([b[0] for b in blocks]), whole.points.positions[start:])
+        np.testing.assert_array_equal(
+            np.concatenate([b[0] for b in blocks]), whole.points.positions[start:]
+        )
         colors = np.concatenate([b[1] for b in blocks])
         np.testing.assert_array_equal(colors, whole.points.colors[start:])
         assert stream.count == 3000
@@ -83,7 +86,8 @@ def test_lifted_tiles_are_the_lifted_cloud(tmp_path: Path) -> None:
     assert not (tmp_path / "tiles" / ".parts").exists()
 
     near = (points.positions - store.offset).astype(np.float32)
-    right = np.concatenate([core for core, _ in store.tree.route(near)])  # each tile's points, in order
+    # each tile's points, in order
+    right = np.concatenate([core for core, _ in store.tree.route(near)])
     parts = [store.read(i) for i in range(len(store.tiles))]
     world = np.concatenate([p.means + p.offset for p in parts])
     np.testing.assert_allclose(world, (whole.means + whole.offset)[right], atol=2e-5, rtol=0)
@@ -95,7 +99,8 @@ def test_lifted_tiles_are_the_lifted_cloud(tmp_path: Path) -> None:
 
     assert same.mean() > 0.999
     halos = np.concatenate(halos_of(store))
-    assert np.isin(as_set(halos), as_set(np.concatenate(tiles_of(store)))).all()  # of the same discs
+    # of the same discs
+    assert np.isin(as_set(halos), as_set(np.concatenate(tiles_of(store)))).all()
 
 
 def test_one_tile_is_the_lifted_cloud(tmp_path: Path) -> None:
@@ -112,7 +117,9 @@ def test_one_tile_is_the_lifted_cloud(tmp_path: Path) -> None:
 
 def test_several_clouds_are_one(tmp_path: Path) -> None:
     whole = streets(4000, offset=UTM)
-    parts = [Points(whole.positions[s], whole.colors[s]) for s in (slice(0, 2500), slice(2500, None))]
+    parts = [
+        Points(whole.positions[s], whole.colors[s]) for s in (slice(0, 2500), slice(2500, None))
+    ]
     paths = [las(tmp_path / "a.laz", parts[0], 255), las(tmp_path / "b.las", parts[1])]
     store = ingest(paths, tmp_path / "tiles", tile_rows=1000, block_rows=333)
     assert store.count == 4000
@@ -151,7 +158,9 @@ def test_an_interrupted_lift_continues_where_it_was(tmp_path: Path, stage: str) 
     with pytest.raises(KeyboardInterrupt):
         ingest(path, folder, tile_rows=800, block_rows=300, progress=interrupt_at(stage, 1200))
     stages = []
-    store = ingest(path, folder, tile_rows=800, block_rows=300, progress=lambda *words: stages.append(words))
+    store = ingest(
+        path, folder, tile_rows=800, block_rows=300, progress=lambda *words: stages.append(words)
+    )
     assert next(done for name, done, *_ in stages if name == stage) >= 300  # a tile, or four parts
     assert not list(folder.glob(".*"))
     assert files_of(folder) == files_of(whole.folder)
@@ -203,7 +212,9 @@ def test_bad_points_are_dropped_and_noted(tmp_path: Path) -> None:
 
     points = streets(500)
     properties = {axis: points.positions[:, i].copy() for i, axis in enumerate("xyz")}
-    properties |= {n: points.colors[:, i].astype(float) for i, n in enumerate(("red", "green", "blue"))}
+    properties |= {
+        n: points.colors[:, i].astype(float) for i, n in enumerate(("red", "green", "blue"))
+    }
     properties["y"][[7, 400]] = np.nan
     path = save(tmp_path / "a.ply", properties, dtype="f8")
     store = ingest(path, tmp_path / "tiles", tile_rows=100, block_rows=64)

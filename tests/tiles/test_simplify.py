@@ -109,15 +109,21 @@ def test_one_tile_is_the_whole_to_the_bit(seen: bool) -> None:
 def test_the_cheapest_of_several_arrays_are_those_of_all() -> None:
     rng = np.random.default_rng(0)
     for _ in range(30):
-        arrays = [rng.integers(0, 6, rng.integers(0, 40)).astype(np.float32) * 0.3 for _ in range(4)]
-        tagged = sorted((float(v), t, i) for t, array in enumerate(arrays) for i, v in enumerate(array))
+        arrays = [
+            rng.integers(0, 6, rng.integers(0, 40)).astype(np.float32) * 0.3 for _ in range(4)
+        ]
+        tagged = sorted(
+            (float(v), t, i) for t, array in enumerate(arrays) for i, v in enumerate(array)
+        )
         count = int(rng.integers(0, len(tagged) + 1))
         naive = [sum(t == tile for _, t, _ in tagged[:count]) for tile in range(4)]
         assert cheapest([lambda a=a: a for a in arrays], count) == naive
 
 
 @pytest.mark.parametrize("blind", [False, True])
-def test_exact_count_and_quality(store: TileStore, scene: Path, tmp_path: Path, blind: bool) -> None:
+def test_exact_count_and_quality(
+    store: TileStore, scene: Path, tmp_path: Path, blind: bool
+) -> None:
     views = ring(8)
     small = reduced(store, tmp_path, views=None if blind else views)
     assert len(store.tiles) >= 4
@@ -150,7 +156,9 @@ def test_sizes_and_spreads_of_any_magnitude(
 
 def test_tiles_that_no_view_sees_keep_their_share(store: TileStore, tmp_path: Path) -> None:
     K = [[300, 0, 40], [0, 300, 30], [0, 0, 1]]
-    corner = Cameras.from_lists([look_at([-7.5, -3.5, 1.5], [-7.6, -3.4, 0])], [K], [(80, 60)], ["corner"])
+    corner = Cameras.from_lists(
+        [look_at([-7.5, -3.5, 1.5], [-7.6, -3.4, 0])], [K], [(80, 60)], ["corner"]
+    )
     small = reduced(store, tmp_path, views=corner)
     assert len(small) == 900
     rows = [len(core) for core, _ in store.tree.route(small.means)]
@@ -168,14 +176,18 @@ def test_rows_that_no_view_sees_are_counted(tmp_path: Path) -> None:
     down = [look_at(eye, [eye[0], eye[1] + 1e-3, 0]) for eye in west]
     views = Cameras.from_lists(down, [K] * 3, [(80, 60)] * 3, ["a", "b", "c"])
     with executor() as runs:
-        done = simplify_tiles(TiledRun(tiles, Workers(runs, tmp_path), SimplifyConfig()), 900, views)
+        done = simplify_tiles(
+            TiledRun(tiles, Workers(runs, tmp_path), SimplifyConfig()), 900, views
+        )
     unseen = np.count_nonzero(visibility_source(views)(scene).weight == 0)
     assert done.report.unseen == pytest.approx(unseen, rel=0.02)
     assert len(scene) / 2 < unseen < len(scene)
 
 
 @pytest.mark.parametrize(("found", "rounds"), [(5, 2), (9, 2), (10, 4), (20, 4)])
-def test_views_are_added_until_a_round_finds_under_a_hundredth_more(found: int, rounds: int) -> None:
+def test_views_are_added_until_a_round_finds_under_a_hundredth_more(
+    found: int, rounds: int
+) -> None:
     class Sums:
         weight = np.zeros(1000)
 
@@ -266,7 +278,11 @@ def test_an_order_found_before_is_checked(scene: Path) -> None:
     again.restore(order, bounds)
     np.testing.assert_array_equal(again.core.order, order)
     assert again.core.origin == dense.core.origin
-    for broken in (order[:-1], np.where(order == 7, 8, order).astype(np.uint32), order + np.uint32(1)):
+    for broken in (
+        order[:-1],
+        np.where(order == 7, 8, order).astype(np.uint32),
+        order + np.uint32(1),
+    ):
         with pytest.raises(InputError, match="order: expected each of 9000 rows once"):
             again.restore(broken, bounds)
 
@@ -274,7 +290,9 @@ def test_an_order_found_before_is_checked(scene: Path) -> None:
 def test_budgets_out_of_reach_are_refused(store: TileStore, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"expected 1 to 9,000"):
         reduced(store, tmp_path, budget=9001)
-    with pytest.raises(InputError, match=r"the 4 tiles keep at least 4 Gaussians \(one per tile\), got 2"):
+    with pytest.raises(
+        InputError, match=r"the 4 tiles keep at least 4 Gaussians \(one per tile\), got 2"
+    ):
         reduced(store, tmp_path, budget=2)
 
 
@@ -324,7 +342,9 @@ def test_progress_moves_within_a_task(tmp_path: Path, workers: int) -> None:
         for i in range(2)
     ]
     with executor(workers) as runs:
-        Workers(runs, tmp_path, lambda stage, done, total, info=None: seen.append(done)).run(tasks, "half")
+        Workers(runs, tmp_path, lambda stage, done, total, info=None: seen.append(done)).run(
+            tasks, "half"
+        )
     assert 50 in seen
     assert seen == sorted(seen)
     assert seen[-1] == 200
@@ -339,7 +359,9 @@ def test_coarse_surroundings_begin_where_the_halo_ends(store: TileStore, tmp_pat
         levels = [None if other is tile else "near" for other in store.tiles]
         far = far_around(store, {"tile": tile.index, "levels": levels, "coarse": coarse})
         found = np.concatenate([part.means for part in far])
-        others = np.concatenate([part for part, level in zip(everything, levels, strict=True) if level])
+        others = np.concatenate(
+            [part for part, level in zip(everything, levels, strict=True) if level]
+        )
         # How far each lies outside the tile, along the axis where it is farthest.
         away = np.maximum(np.array(tile.low) - others, others - np.array(tile.high)).max(axis=1)
         assert ((away > 0) & (away <= store.margin)).any()
@@ -348,7 +370,9 @@ def test_coarse_surroundings_begin_where_the_halo_ends(store: TileStore, tmp_pat
 
 def test_a_sample_for_views_has_enough_rows(store: TileStore, tmp_path: Path) -> None:
     with executor() as runs:
-        assert len(TiledRun(store, Workers(runs, tmp_path), SimplifyConfig()).sample()) == store.count
+        assert (
+            len(TiledRun(store, Workers(runs, tmp_path), SimplifyConfig()).sample()) == store.count
+        )
 
 
 @pytest.mark.parametrize("seen", [True, False])
@@ -374,4 +398,7 @@ def test_a_floor_in_tiles_stays_as_closed_as_in_one_piece(tmp_path: Path, seen: 
     assert lost[1] == pytest.approx(lost[0], abs=0.02)
     assert measured == (pytest.approx(lost[1], abs=1e-3) if seen else None)
     assert tiled(SimplifyConfig(), gaps=False)[1] is None
-    assert opacity_lost(lifted, tiled(SimplifyConfig(max_growth=1), gaps=False)[0], ring()) > lost[1] + 0.02
+    assert (
+        opacity_lost(lifted, tiled(SimplifyConfig(max_growth=1), gaps=False)[0], ring())
+        > lost[1] + 0.02
+    )

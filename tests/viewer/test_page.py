@@ -47,7 +47,9 @@ class Parts(HTMLParser):
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         given = dict(attrs)
-        self.addresses += [value or "" for key, value in attrs if key in ("src", "href", "srcset", "data")]
+        self.addresses += [
+            value or "" for key, value in attrs if key in ("src", "href", "srcset", "data")
+        ]
         self._into = (given.get("id") or given.get("type") or "") if tag == "script" else ""
         if given.get("class") == "label":
             self._into = "label"
@@ -98,7 +100,12 @@ def test_a_page_holds_viewer_and_scene_and_names_no_address(tmp_path: Path) -> N
     assert view == {
         "start": {"position": [1, 2, 3], "target": [0, 0, 0.5], "fov": [[0.5, 42], [2, 30]]},
         "stops": [
-            {"title": "worst", "position": [1, 2, 3], "target": [0, 0, 0.5], "fov": [[0.5, 42], [2, 30]]}
+            {
+                "title": "worst",
+                "position": [1, 2, 3],
+                "target": [0, 0, 0.5],
+                "fov": [[0.5, 42], [2, 30]],
+            }
         ],
         "background": [1, 0.5, 0.25],
         "files": ["scene0.sog"],
@@ -127,7 +134,9 @@ def test_equal_scenes_give_equal_bytes_and_two_scenes_two_scripts(tmp_path: Path
     assert json.loads(parts.scripts["view"])["start"] is None
 
 
-def test_failures_leave_no_half_written_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_failures_leave_no_half_written_page(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     ball = checkered_ball(20)
     with pytest.raises(OutputError, match=r"a\.txt: expected a file name that ends in \.html"):
         check_page_output(tmp_path / "a.txt")
@@ -161,7 +170,8 @@ def test_the_start_shows_what_the_view_shows(seed: int) -> None:
     rng = np.random.default_rng(seed)
     ball = checkered_ball(300)
     offset = rng.normal(size=3) * 10.0 ** rng.integers(0, 6)
-    up = rng.normal(size=3) if seed else np.array([0.0, 1.0, 0.0])  # the very opposite of the viewer's
+    # the very opposite of the viewer's
+    up = rng.normal(size=3) if seed else np.array([0.0, 1.0, 0.0])
     size = (int(rng.integers(100, 400)), int(rng.integers(100, 400)))
     scene = Splats.create(
         ball.means, quats=ball.quats, scales=ball.scales, sh0=ball.sh0, shN=ball.shN, offset=offset
@@ -254,13 +264,18 @@ def test_a_run_has_a_page_unless_too_large(tmp_path: Path, monkeypatch: pytest.M
     write_splats(tmp_path / "ball.ply", ball)
     whole = Source(tmp_path / "ball.ply"), ball
     folder.write_view(ball.take(range(30)), whole, around(6), (1.0, 1.0, 1.0))
-    assert Parts(path).labels == ["dense scene: ball.ply, 300 Gaussians", "result: run, 30 Gaussians"]
+    assert Parts(path).labels == [
+        "dense scene: ball.ply, 300 Gaussians",
+        "result: run, 30 Gaussians",
+    ]
     for dense, largest in ((ball, 299), (ball.take(range(30)), 300)):  # too large, or the same
         monkeypatch.setattr("g2ard.cli.run_folder.LARGEST_DENSE", largest)
         folder.write_view(ball.take(range(30)), (whole[0], dense), around(6), (1.0, 1.0, 1.0))
         assert Parts(path).labels == ["result: run, 30 Gaussians"]
     config = {"keep": False, "views_format": "g2ard"}
-    run = SimpleNamespace(write=lambda scene, splats, **_: write_splats(scene, splats), config=config)
+    run = SimpleNamespace(
+        write=lambda scene, splats, **_: write_splats(scene, splats), config=config
+    )
     views = RunViews(ViewSet(around(4)), around(2))
     RunFolder(run, tmp_path / "run", "scene.sog", resume=False).write(
         SimpleNamespace(splats=ball), views, SimpleNamespace(apart=None)

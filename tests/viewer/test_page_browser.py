@@ -33,7 +33,9 @@ def browser(page: Browser) -> Browser:
     return page
 
 
-def save(path: Path, *scenes: Splats, camera: Camera = FRONT, up: tuple[float, ...] = (0, 0, 1)) -> Path:
+def save(
+    path: Path, *scenes: Splats, camera: Camera = FRONT, up: tuple[float, ...] = (0, 0, 1)
+) -> Path:
     """A page of scenes that opens with a camera."""
     stand = place_frame(scenes[0], Cameras.of([camera]), up=up, start=camera.name)
     shown = [(f"scene {index}", stand.of(scene)) for index, scene in enumerate(scenes)]
@@ -55,13 +57,16 @@ def scattered(count: int = 4000, seed: int = 0) -> Splats:
 
 
 @pytest.mark.parametrize("up", [(0.0, 0.0, 1.0), (0.3, -1.0, 0.2)])
-def test_a_page_shows_g2ards_render(browser: Browser, tmp_path: Path, up: tuple[float, ...]) -> None:
+def test_a_page_shows_g2ards_render(
+    browser: Browser, tmp_path: Path, up: tuple[float, ...]
+) -> None:
     scene = scattered()
     camera = Camera.facing([1.8, -1.6, 0.9], [0, 0, 0], width=WIDTH, height=HEIGHT, fov=55, up=up)
     browser.requests.clear()
     show(browser, save(tmp_path / "one.html", scene, camera=camera, up=up))
     picture = assert_shows(browser, rendered(scene, camera), 38)
-    assert psnr(picture[:, ::-1], rendered(scene, camera)) < 30  # and would tell another picture apart
+    # and would tell another picture apart
+    assert psnr(picture[:, ::-1], rendered(scene, camera)) < 30
     assert {re.split(r"[:/]", url)[0] for url in browser.requests} <= {"file", "blob", "data"}
     assert browser.run("document.getElementById('trouble').hidden")
 
@@ -135,7 +140,10 @@ def test_arrows_lead_to_the_next_stop(browser: Browser, tmp_path: Path) -> None:
         place_frame(scene, Cameras.of([FRONT]), up=(0, 0, 1), start="front"),
         sample_opaque_points(scene),
     )
-    stops = [(name, stand.start_at(view, points)) for name, view in (("typical", FRONT), ("worst", other))]
+    stops = [
+        (name, stand.start_at(view, points))
+        for name, view in (("typical", FRONT), ("worst", other))
+    ]
     page = tmp_path / "stops.html"
     write_page(page, [("scene", stand.of(scene))], start=stand.start, stops=stops, background=GREY)
     show(browser, page)
@@ -175,8 +183,13 @@ def test_a_window_of_any_shape_shows_the_whole_view(
 def test_a_narrow_page_opens_readable_and_shows_each_scene_alone(tmp_path: Path) -> None:
     scene = scattered(400)
     stand = place_frame(scene, Cameras.of([FRONT]), up=(0, 0, 1))
-    names = ["a_scene_with_a_long_name.ply: 1,234,567 Gaussians", "another_long_name.ply: 12,345 Gaussians"]
-    write_page(tmp_path / "two.html", [(name, stand.of(scene)) for name in names], start=stand.start)
+    names = [
+        "a_scene_with_a_long_name.ply: 1,234,567 Gaussians",
+        "another_long_name.ply: 12,345 Gaussians",
+    ]
+    write_page(
+        tmp_path / "two.html", [(name, stand.of(scene)) for name in names], start=stand.start
+    )
     with Browser(390, 700) as page:
         show(page, tmp_path / "two.html")
         labels = "[...document.querySelectorAll('.label')]"
@@ -192,7 +205,9 @@ def test_a_narrow_page_opens_readable_and_shows_each_scene_alone(tmp_path: Path)
         assert page.run(press.format(1)) == "inset(0px 0px 0px 50%)"
 
 
-def test_without_a_background_scenes_are_before_a_soft_gradient(browser: Browser, tmp_path: Path) -> None:
+def test_without_a_background_scenes_are_before_a_soft_gradient(
+    browser: Browser, tmp_path: Path
+) -> None:
     scene = scattered()
     stand = place_frame(scene, Cameras.of([FRONT]), up=(0, 0, 1), start="front")
     shown = [(name, stand.of(scene)) for name in ("left", "right")]

@@ -69,14 +69,18 @@ def globe_page(folder: Path) -> str:
     cloud_of(folder / "cloud.ply", levels[0])
     save_tileset(folder / "globe", levels, up=UP)
     (folder / "globe" / "cesium").symlink_to(cesium)
-    write_level_page(folder / "globe", levels, "3dtiles", GivenViews(None, folder / "cloud.ply", UP))
+    write_level_page(
+        folder / "globe", levels, "3dtiles", GivenViews(None, folder / "cloud.ply", UP)
+    )
     return "globe/?cesium=cesium"
 
 
 def report_page(folder: Path) -> str:
     red = np.zeros((240, 320, 3), np.uint8) + np.uint8([230, 30, 30])
     page = Page("scene.ply: 500,000 → 50,000", "A verdict.")
-    page.comparison("view_0000", red, [Shown("result", red, "30 dB"), Shown("simplified", red, "28 dB")])
+    page.comparison(
+        "view_0000", red, [Shown("result", red, "30 dB"), Shown("simplified", red, "28 dB")]
+    )
     page.details("settings", [["recover.steps", "500"]])
     page.write(folder / "report.html")
     return "report.html"
@@ -123,7 +127,9 @@ def test_a_page_suits_the_screen(browser: Browser, page: tuple[str, str], screen
     browser.resize(width, height)
     if kind == "report":
         browser.open(address)
-        browser.run("new Promise(done => { onload = done; document.readyState === 'complete' && done() })")
+        browser.run(
+            "new Promise(done => { onload = done; document.readyState === 'complete' && done() })"
+        )
         browser.run("document.querySelector('.slider').scrollIntoView({ block: 'center' })")
         colourful = _boxed
     else:
@@ -139,7 +145,9 @@ def test_a_page_suits_the_screen(browser: Browser, page: tuple[str, str], screen
 def _boxed(browser: Browser, picture: np.ndarray) -> list[float]:
     """Return left, top, right and bottom of the picture of a report."""
     sides = "(({ left, top, right, bottom }) => [left, top, right, bottom])"
-    found: list[float] = browser.run(f"{sides}(document.querySelector('.slider').getBoundingClientRect())")
+    found: list[float] = browser.run(
+        f"{sides}(document.querySelector('.slider').getBoundingClientRect())"
+    )
     return found
 
 
@@ -174,7 +182,9 @@ _CONTROLS = """[...document.querySelectorAll('button, select, input, summary, [t
 
 def _assert_reached(browser: Browser, least: int) -> None:
     """Check that Tab leads to all controls, also to hidden ones, and that they are large enough."""
-    browser.run("globalThis.g2ard?.ready.then(([viewer]) => { viewer.state.controlsHidden = true; })")
+    browser.run(
+        "globalThis.g2ard?.ready.then(([viewer]) => { viewer.state.controlsHidden = true; })"
+    )
     browser.press("Tab", _TAB)
     count = browser.run(f"{_CONTROLS}.length")
     for _ in range(count):

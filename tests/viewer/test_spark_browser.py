@@ -85,8 +85,11 @@ def test_spark_shows_a_file(
     matrix = flip @ np.linalg.inv(VIEW.viewmat) @ flip
     fov = float(np.degrees(2 * np.arctan(HEIGHT / 2 / VIEW.K[1, 1])))
     expected = np.clip(Renderer(scene).image(VIEW), 0, 1)
-    for turn in (turned, not turned) if name in ("a.ply", "a.spz") else (turned,):  # wrong ones look unlike
-        browser.run(f"show('{name}', {json.dumps(turn)}, {json.dumps(matrix.T.ravel().tolist())}, {fov})")
+    # wrong ones look unlike
+    for turn in (turned, not turned) if name in ("a.ply", "a.spz") else (turned,):
+        browser.run(
+            f"show('{name}', {json.dumps(turn)}, {json.dumps(matrix.T.ravel().tolist())}, {fov})"
+        )
         likeness = psnr(browser.picture() / np.float32(255), expected)
         assert (likeness > 30) == (turn == turned), likeness
 
@@ -110,6 +113,8 @@ def test_spark_shows_a_map_upright(shown: tuple[Path, Browser], name: str, turne
     flip = np.diag([1.0, -1, -1, 1])
     matrix = flip @ np.linalg.inv(VIEW.viewmat) @ flip
     fov = float(np.degrees(2 * np.arctan(HEIGHT / 2 / VIEW.K[1, 1])))
-    browser.run(f"show('{name}', {json.dumps(turned)}, {json.dumps(matrix.T.ravel().tolist())}, {fov})")
+    browser.run(
+        f"show('{name}', {json.dumps(turned)}, {json.dumps(matrix.T.ravel().tolist())}, {fov})"
+    )
     expected = np.clip(Renderer(ball).image(VIEW), 0, 1)
     assert psnr(browser.picture() / np.float32(255), expected) > 30

@@ -80,7 +80,9 @@ def adapt(
         return
     stops = first < most and config.tolerance > 0
     least = f"{first:,} to " if stops else ""
-    run.say(f"{plural(count, 'image')}: {least}{plural(most, 'step')}{', as long as they gain' * stops}")
+    run.say(
+        f"{plural(count, 'image')}: {least}{plural(most, 'step')}{', as long as they gain' * stops}"
+    )
     with stoppable(run, work, resume, output):
         work.mkdir(parents=True, exist_ok=True)
         result = refit(splats, targets, config, work=work, progress=run.progress)

@@ -56,7 +56,8 @@ def clean(
     split_sky: Annotated[
         Path | None,
         typer.Option(
-            metavar="FILE", help="Write sky and far background to this scene, whole, and the rest to OUT."
+            metavar="FILE",
+            help="Write sky and far background to this scene, whole, and the rest to OUT.",
         ),
     ] = None,
     strength: Annotated[
@@ -88,7 +89,9 @@ def clean(
     from g2ard.jobs.clean import clean as remove_clutter
     from g2ard.jobs.cost import cost_of_cleaning
 
-    kinds = None if only is None else tuple(word.strip() for word in only.split(",") if only != "none")
+    kinds = (
+        None if only is None else tuple(word.strip() for word in only.split(",") if only != "none")
+    )
     with run.usage():
         wanted = choose_kinds(kinds, strength)
     if preview is not None and kinds == ():
@@ -117,7 +120,9 @@ def clean(
     sky_count = 0 if done.sky is None else len(done.sky)
     if output is not None:
         if not kept:
-            raise InputError("every Gaussian would be removed; give --preview without -o", path=scene)
+            raise InputError(
+                "every Gaussian would be removed; give --preview without -o", path=scene
+            )
         run.write(output, done.splats)
         run.say(f"{output}: keeps {kept:,} of {plural(total, 'Gaussian')}")
         if split_sky is not None and done.sky is not None:
@@ -158,7 +163,9 @@ def _paint(path: Path, done: Cleaned, cameras: Cameras, overwrite: bool) -> None
     chosen = evenly_spaced(len(cameras), 3, floor=True)
     renderers = [Renderer(scene) for scene in scenes]
     rows = [[r.clipped(cameras[int(view)]) for r in renderers] for view in chosen]
-    found = [(name, count, _COLORS[name][0]) for name, count in done.clutter.counts.items() if count]
+    found = [
+        (name, count, _COLORS[name][0]) for name, count in done.clutter.counts.items() if count
+    ]
     legend = ", ".join(
         f"{word}: {count:,} {name}" if word else f"{count:,} {name} (nothing to show)"
         for name, count, word in found

@@ -26,8 +26,12 @@ _WORST_VIEWS = 3
 @command("compare", example="g2ard compare dense.ply small.ply -o compare.html", scenes=True)
 def compare(
     run: Run,
-    first: Annotated[Path, typer.Argument(metavar="SCENE|RUN", help="The dense scene, or another one.")],
-    second: Annotated[Path, typer.Argument(metavar="SCENE|RUN", help="The scene to compare with it.")],
+    first: Annotated[
+        Path, typer.Argument(metavar="SCENE|RUN", help="The dense scene, or another one.")
+    ],
+    second: Annotated[
+        Path, typer.Argument(metavar="SCENE|RUN", help="The scene to compare with it.")
+    ],
     output: Annotated[
         Path | None,
         typer.Option(
@@ -48,7 +52,12 @@ def compare(
     from g2ard.jobs.inputs import GivenViews, load_views
     from g2ard.jobs.run_views import choose_plan_size, find_or_plan_views, is_planned, resize_views
     from g2ard.jobs.view_checks import check_sight, sample_opaque_points
-    from g2ard.jobs.viewer_frame import choose_backdrop, choose_level_views, find_shared_up, place_frame
+    from g2ard.jobs.viewer_frame import (
+        choose_backdrop,
+        choose_level_views,
+        find_shared_up,
+        place_frame,
+    )
     from g2ard.rendering.targets import TeacherRenders
     from g2ard.scene.cameras import Cameras
     from g2ard.stages.evaluate import evaluate
@@ -107,7 +116,9 @@ def compare(
             stops = []
             for what, name in shown.items():
                 camera = cameras[cameras.names.index(name)]
-                stops.append((f"{what}: {name}, {psnr[name]:.1f} dB", stand.start_at(camera, points)))
+                stops.append(
+                    (f"{what}: {name}, {psnr[name]:.1f} dB", stand.start_at(camera, points))
+                )
             labels = label_scenes(sources, [len(dense), len(other)], roles)
             scenes = [dense, other]
             stand.write_page(
@@ -115,7 +126,9 @@ def compare(
                 labels,
                 scenes,
                 stops=stops,
-                background=choose_backdrop(known, scenes, of_points=is_made_of_points(first, sources[0])),
+                background=choose_backdrop(
+                    known, scenes, of_points=is_made_of_points(first, sources[0])
+                ),
                 overwrite=run.overwrite,
                 progress=run.progress,
             )
@@ -124,7 +137,9 @@ def compare(
     closer = _name_closer(run, first, second, dense, other, colour)
     if closer is not None:
         run.say(closer)
-    run.result({**scores.as_dict(), "closer": closer, "output": None if output is None else str(output)})
+    run.result(
+        {**scores.as_dict(), "closer": closer, "output": None if output is None else str(output)}
+    )
 
 
 def _name_closer(
@@ -156,7 +171,8 @@ def _name_closer(
     teaching.propose_background(cameras)
     targets = drop_unscorable(teaching.targets(cameras, run.say))
     scores = [
-        evaluate(splats, targets, background=colour, progress=run.progress) for splats in (dense, other)
+        evaluate(splats, targets, background=colour, progress=run.progress)
+        for splats in (dense, other)
     ]
     line = describe_better(name_scenes([first, second]), scores, targets, "test")
     targets_of = "the photos" if common.teacher is None else str(common.teacher)

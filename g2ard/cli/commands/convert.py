@@ -45,7 +45,9 @@ def convert(
     ] = None,
     box: Annotated[
         str | None,
-        typer.Option(metavar="X,Y,Z,X,Y,Z", help="Keep Gaussians between two corners, scene units."),
+        typer.Option(
+            metavar="X,Y,Z,X,Y,Z", help="Keep Gaussians between two corners, scene units."
+        ),
     ] = None,
     sphere: Annotated[
         str | None, typer.Option(metavar="X,Y,Z,R", help="Keep Gaussians within R of a point.")
@@ -79,12 +81,16 @@ def convert(
     ] = None,
     rotate: Annotated[
         str | None,
-        typer.Option(metavar="X,Y,Z", help="Then rotate about the x, y and z axes in turn, degrees."),
+        typer.Option(
+            metavar="X,Y,Z", help="Then rotate about the x, y and z axes in turn, degrees."
+        ),
     ] = None,
     translate: Annotated[
         str | None, typer.Option(metavar="X,Y,Z", help="Then move by this, scene units.")
     ] = None,
-    recentre: Annotated[bool, typer.Option("--recentre", help="Drop the offset to map coordinates.")] = False,
+    recentre: Annotated[
+        bool, typer.Option("--recentre", help="Drop the offset to map coordinates.")
+    ] = False,
     from_axes: Annotated[
         AxesName | None,
         typer.Option(
@@ -110,7 +116,8 @@ def convert(
         ),
     ] = None,
     spz_version: Annotated[
-        int | None, typer.Option(min=2, max=4, help="Version of .spz files; 3 by default, 4 is smaller.")
+        int | None,
+        typer.Option(min=2, max=4, help="Version of .spz files; 3 by default, 4 is smaller."),
     ] = None,
     compress: Annotated[
         Literal["spz"] | None, typer.Option(help="Write an SPZ inside of a .glb, for CesiumJS.")
@@ -156,7 +163,9 @@ def convert(
     _check_output(run, output, options)
     if to_axes is not None and not as_table and (defined := scene_format(output)).axes is not None:
         changes = replace(changes, to_axes=None)  # the format's writer makes the change
-        options = _add_axes(options, defined, output, NAMED_AXES.get(to_axes) or cast("Axes", to_axes))
+        options = _add_axes(
+            options, defined, output, NAMED_AXES.get(to_axes) or cast("Axes", to_axes)
+        )
     run.begin("read")
     whole = read_merged(opened, points, from_axes, **run.callbacks)
     splats = changes.apply(whole)
@@ -172,7 +181,9 @@ def convert(
     kept = f"{len(splats):,}" if len(splats) == read else f"{len(splats):,} of {read:,}"
     what = "Gaussian" if kept == "1" else "Gaussians"
     run.say(f"{output}: {kept} {what}, {size / 1e6:.2f} MB, {size / len(splats):.1f} bytes each")
-    run.result({"output": str(output), "input_count": read, "output_count": len(splats), "bytes": size})
+    run.result(
+        {"output": str(output), "input_count": read, "output_count": len(splats), "bytes": size}
+    )
 
 
 def _part_paths(run: Run, paths: list[Path], output: Path | None) -> tuple[list[Path], Path]:

@@ -25,7 +25,15 @@ from g2ard.io import Source
         *("simplify.method", "simplify.keep_region", "select.focus"),
         *(
             f"recover.{name}"
-            for name in ("schedule", "steps", "recovery_time", "sh_degree", "engine", "background", "seed")
+            for name in (
+                "schedule",
+                "steps",
+                "recovery_time",
+                "sh_degree",
+                "engine",
+                "background",
+                "seed",
+            )
         ),
     ),
     scenes=True,
@@ -57,7 +65,9 @@ def distill(
     ] = None,
     held_out: Annotated[
         Path | None,
-        typer.Option(metavar="VIEWS", help="Views to score on. --views is then used for training only."),
+        typer.Option(
+            metavar="VIEWS", help="Views to score on. --views is then used for training only."
+        ),
     ] = None,
     preset: opt.PresetOption = "auto",
     time: opt.TimeOption = None,
@@ -69,15 +79,19 @@ def distill(
     views_format: opt.ViewsFormatOption = "g2ard",
     clean: Annotated[
         bool,
-        typer.Option("--clean", help="First remove invisible and stray Gaussians, as `g2ard clean` does."),
+        typer.Option(
+            "--clean", help="First remove invisible and stray Gaussians, as `g2ard clean` does."
+        ),
     ] = False,
     page: Annotated[
-        bool, typer.Option("--page/--no-page", help="Write view.html, a viewer page with the scene.")
+        bool,
+        typer.Option("--page/--no-page", help="Write view.html, a viewer page with the scene."),
     ] = True,
     compare: Annotated[
         bool,
         typer.Option(
-            "--compare/--no-compare", help="Show a small dense scene beside the result in view.html."
+            "--compare/--no-compare",
+            help="Show a small dense scene beside the result in view.html.",
         ),
     ] = True,
     resume: opt.ResumeOption = False,
@@ -160,7 +174,8 @@ def distill(
             line = ""
             with run.showing("choosing views for report.html"):
                 drawn = Drawn(
-                    choose_best_targets(job, done), list(filter(None, (done.held_out, job.targets.apart)))
+                    choose_best_targets(job, done),
+                    list(filter(None, (done.held_out, job.targets.apart))),
                 )
             with run.finishing("scoring"):
                 report = describe_run(job, done, folder.scene, drawn)

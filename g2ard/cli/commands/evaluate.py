@@ -46,14 +46,17 @@ def evaluate(
     teacher: opt.TeacherOption = None,
     photos: opt.PhotosOption = False,
     anchors: Annotated[
-        Path | None, typer.Option(metavar="SCENE", help="The same Gaussians before recovery; adds Drift95.")
+        Path | None,
+        typer.Option(metavar="SCENE", help="The same Gaussians before recovery; adds Drift95."),
     ] = None,
     lpips: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Folder with LPIPS weights; adds LPIPS.")
     ] = None,
     lpips_input: Annotated[
         LpipsInput,
-        typer.Option(help="Scale images to [-1, 1], as LPIPS expects, or feed [0, 1] as 3DGS does."),
+        typer.Option(
+            help="Scale images to [-1, 1], as LPIPS expects, or feed [0, 1] as 3DGS does."
+        ),
     ] = "scaled",
     convention: opt.ConventionOption = "gsplat",
     eight_bit: Annotated[
@@ -122,7 +125,9 @@ def evaluate(
         dense, colour, chosen=chosen is not None, insisted=photos, settings=settings, say=run.say
     )
     if dense is not None:
-        given = find_or_plan_views(dense, GivenViews(given, teacher, seed=run.seed, **run.callbacks))
+        given = find_or_plan_views(
+            dense, GivenViews(given, teacher, seed=run.seed, **run.callbacks)
+        )
     assert given is not None  # `check_teacher`
     full = load_views(given, split, None, run.say, unpictured=dense is not None)
     fitted = full.fitted(size)
@@ -181,13 +186,30 @@ def evaluate(
         results = zip(scenes, loaded, judged, strict=True)
         with run.showing("--output"):
             advice = _write_ladder(
-                run, output, list(results), unshrunk or targets, dense, teacher, teaching, given, settings
+                run,
+                output,
+                list(results),
+                unshrunk or targets,
+                dense,
+                teacher,
+                teaching,
+                given,
+                settings,
             )
     counts = Counter(view["against"] for view in rows[0]["views"])
     single = {"photo": "photos", "teacher": "teacher"}
     against = counts if len(counts) > 1 else single[next(iter(counts))]
-    followed = {"convention": convention, "8bit": eight_bit, "lpips_input": lpips_input if lpips else None}
-    told = {"against": against, "scored_in": scored_in(targets, name), "better": better, "advice": advice}
+    followed = {
+        "convention": convention,
+        "8bit": eight_bit,
+        "lpips_input": lpips_input if lpips else None,
+    }
+    told = {
+        "against": against,
+        "scored_in": scored_in(targets, name),
+        "better": better,
+        "advice": advice,
+    }
     run.result({**told, "protocol": followed, "scenes": rows})
 
 
@@ -216,7 +238,9 @@ def _write_ladder(
     if dense is not None and teacher is not None:
         top = Dense(teacher.name, len(dense), bytes_of(teacher))
     names = name_scenes([path for path, _, _ in results])
-    words = label_sizes(names, [len(splats) for _, splats, _ in results], None if top is None else top.count)
+    words = label_sizes(
+        names, [len(splats) for _, splats, _ in results], None if top is None else top.count
+    )
     rungs = sorted(
         (
             Rung(name, word, bytes_of(path), splats, scores)
@@ -225,7 +249,9 @@ def _write_ladder(
         key=lambda rung: (rung.bytes, rung.name),
     )
     if dense is not None and not teaching.photos and is_planned(views):
-        best = choose_level_views(dense, 1, cameras).resized(max(cameras[0].width, cameras[0].height))
+        best = choose_level_views(dense, 1, cameras).resized(
+            max(cameras[0].width, cameras[0].height)
+        )
         shown: Targets = TeacherRenders(dense, best, background=teaching.background)
     else:
         name = best_views(rungs[-1].splats if dense is None else dense, 1, cameras).names[0]
@@ -254,7 +280,8 @@ def _measure_drift(frozen: Splats, splats: Splats, path: Path) -> float:
 
     if len(frozen) != len(splats):
         raise InputError(
-            f"expected the {len(splats):,} Gaussians of {path}, got {len(frozen):,}", parameter="anchors"
+            f"expected the {len(splats):,} Gaussians of {path}, got {len(frozen):,}",
+            parameter="anchors",
         )
     splats = splats.narrowed()
     return drift95(Anchors.of(frozen.narrowed(splats.offset)), splats.means)

@@ -101,7 +101,9 @@ def _describe(given: ViewFiles) -> tuple[Named, list[list[str]]]:
     against = report["against"]
     photos = report.get("photos")
     one = "point" if report.get("lifted") else "Gaussian"
-    rows = [["made from", plural(photos, "photo") if photos else plural(report["input_count"], one)]]
+    rows = [
+        ["made from", plural(photos, "photo") if photos else plural(report["input_count"], one)]
+    ]
     rows.append(["Gaussians per pixel, held-out", f"{report['overdraw']:.1f}"])
     words = {"simplified": "start" if photos else "simplified", "recovered": RESULT}
     size = f", {report['size']}" if "size" in report else ""
@@ -142,7 +144,10 @@ def _list_devices(run: Run) -> None:
     for a in found or ():
         rows += [
             [a.name, f"{a.kind}, {a.backend}, {a.driver}"],
-            ["", f"buffers to {_format_size(a.max_buffer)}, bound {_format_size(a.max_binding)} at a time"],
+            [
+                "",
+                f"buffers to {_format_size(a.max_buffer)}, bound {_format_size(a.max_binding)} at a time",
+            ],
         ]
     if not found:
         why = "this build has no GPU kernels" if found is None else _NO_DRIVER
@@ -173,7 +178,9 @@ def _list_figures(figures: Named) -> list[list[str]]:
         rows.append(["render model", figures["render_model"]])
     if any(figures.get("offset", ())):
         rows.append(["offset", _format_vector(figures["offset"], 3)])
-    rows += _list_known(figures, {"map_system": ("map system", str), "metres_per_unit": ("unit", _name_unit)})
+    rows += _list_known(
+        figures, {"map_system": ("map system", str), "metres_per_unit": ("unit", _name_unit)}
+    )
     extent = figures["extent"]
     longest = max(high - low for low, high in zip(extent["min"], extent["max"], strict=True))
     digits = max(0, 3 - math.floor(math.log10(longest or 1)))
@@ -186,13 +193,18 @@ def _list_figures(figures: Named) -> list[list[str]]:
     formats: _Formats = {
         **{key: (key.replace("_", " "), _describe_spread) for key in spreads},
         "fov_degrees": ("field of view", partial(_describe_spread, unit="°")),
-        "close_overdraw": ("Gaussians per pixel, near", "{0[mean]:.0f}, at worst {0[worst]:.0f}".format),
+        "close_overdraw": (
+            "Gaussians per pixel, near",
+            "{0[mean]:.0f}, at worst {0[worst]:.0f}".format,
+        ),
         "color": ("mean colour", lambda color: _format_vector(color["mean"], 2)),
         **{key: (key.replace("_", " "), "{:,}".format) for key in counts},
     }
     rows += _list_known(figures, formats)
     for key in ("sizes", "splits", "odd"):
-        rows += [[name.replace("_", " "), f"{count:,}"] for name, count in figures.get(key, {}).items()]
+        rows += [
+            [name.replace("_", " "), f"{count:,}"] for name, count in figures.get(key, {}).items()
+        ]
     return rows + [["note", note["text"]] for note in figures["notes"]]
 
 
@@ -202,7 +214,9 @@ _Formats = dict[str, tuple[str, Callable[[Any], str]]]
 
 def _list_known(figures: Named, formats: _Formats) -> list[list[str]]:
     """Return the rows of the figures that are known, in the order of `formats`."""
-    return [[label, write(figures[key])] for key, (label, write) in formats.items() if key in figures]
+    return [
+        [label, write(figures[key])] for key, (label, write) in formats.items() if key in figures
+    ]
 
 
 def _describe_spread(quantiles: dict[str, float], unit: str = "") -> str:

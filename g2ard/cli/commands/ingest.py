@@ -36,7 +36,8 @@ _FEW_ROWS = 500_000
 def ingest(
     run: Run,
     scenes: Annotated[
-        list[Path], typer.Argument(metavar="SCENE…", help="Scenes to join, or coloured point clouds to lift.")
+        list[Path],
+        typer.Argument(metavar="SCENE…", help="Scenes to join, or coloured point clouds to lift."),
     ],
     *,
     output: Annotated[
@@ -65,7 +66,9 @@ def ingest(
         return
     run.claim("--output", output, folder=True)
     began = time.perf_counter()
-    with executor(plan.workers, max(1, tiling.usable_cores // plan.workers), tiling.scheduler) as runs:
+    with executor(
+        plan.workers, max(1, tiling.usable_cores // plan.workers), tiling.scheduler
+    ) as runs:
         store = into_tiles(
             source,
             output,

@@ -19,15 +19,25 @@ from g2ard.progress import plural
 def lift(
     run: Run,
     cloud: Annotated[
-        Path, typer.Argument(metavar="CLOUD", help=f"Coloured points: {suffixes('points')} or COLMAP.")
+        Path,
+        typer.Argument(metavar="CLOUD", help=f"Coloured points: {suffixes('points')} or COLMAP."),
     ],
     output: OutputOption,
-    neighbors: Annotated[int, typer.Option(help="Nearest points to fit each disc's plane to.")] = 10,
+    neighbors: Annotated[
+        int, typer.Option(help="Nearest points to fit each disc's plane to.")
+    ] = 10,
     spread: Annotated[
-        float, typer.Option(help="Width of a disc relative to the standard deviation of its nearest points.")
+        float,
+        typer.Option(
+            help="Width of a disc relative to the standard deviation of its nearest points."
+        ),
     ] = 0.94,
-    normal_ratio: Annotated[float, typer.Option(help="Thickness of a disc relative to its width.")] = 0.1,
-    max_anisotropy: Annotated[float, typer.Option(help="Largest ratio of a disc's two widths.")] = 4.0,
+    normal_ratio: Annotated[
+        float, typer.Option(help="Thickness of a disc relative to its width.")
+    ] = 0.1,
+    max_anisotropy: Annotated[
+        float, typer.Option(help="Largest ratio of a disc's two widths.")
+    ] = 4.0,
     opacity: Annotated[float, typer.Option(help="Opacity of every disc, between 0 and 1.")] = 0.5,
 ) -> None:
     """Turn a coloured point cloud into surface-aligned Gaussian discs, without training."""

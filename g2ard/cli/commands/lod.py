@@ -28,14 +28,19 @@ if TYPE_CHECKING:
 
 
 @command(
-    "lod", example="g2ard lod scene.ply -r 1,2,4,8,16 -o streamed/", scenes=True, tiles=True, points=True
+    "lod",
+    example="g2ard lod scene.ply -r 1,2,4,8,16 -o streamed/",
+    scenes=True,
+    tiles=True,
+    points=True,
 )
 def lod(
     run: Run,
     scene: Annotated[
         Path,
         typer.Argument(
-            metavar="SCENE", help="A trained scene of any format, or a folder of tiles (`g2ard ingest`)."
+            metavar="SCENE",
+            help="A trained scene of any format, or a folder of tiles (`g2ard ingest`).",
         ),
     ],
     others: opt.OthersArgument = None,
@@ -60,7 +65,10 @@ def lod(
         ),
     ] = "1,2,4,8,16",  # type: ignore[assignment]
     recover: Annotated[
-        bool, typer.Option("--recover/--merge-only", help="Recover each level after merging, or only merge.")
+        bool,
+        typer.Option(
+            "--recover/--merge-only", help="Recover each level after merging, or only merge."
+        ),
     ] = True,
     environment: Annotated[
         bool,
@@ -107,7 +115,9 @@ def lod(
     ] = None,
     unit: Annotated[
         LengthUnit | None,
-        typer.Option(help="Unit of the scene with --georeference; by default the scan's or map system's."),
+        typer.Option(
+            help="Unit of the scene with --georeference; by default the scan's or map system's."
+        ),
     ] = None,
     views: opt.ViewsOrMadeOption = None,
     images: opt.ImagesOption = None,
@@ -223,7 +233,9 @@ def lod(
         else:
             axis = choose_tileset_up(levels.splats, up, run.say).tolist()
             stated = source.metres_per_unit or 0.0
-            unit = unit or next((name for name, metres in UNITS.items() if abs(metres - stated) < 1e-7), None)
+            unit = unit or next(
+                (name for name, metres in UNITS.items() if abs(metres - stated) < 1e-7), None
+            )
             written = save_tileset(output, levels.splats, up=axis, place=spot, unit=unit, **common)
         run.note_written(output)
         frame = GivenViews(views, scene, axis)
@@ -232,7 +244,9 @@ def lod(
                 output, levels.splats, kind, frame, background=background, source=source
             )
             query = "" if kind == "sog" else "/?cesium=URL (a folder of CesiumJS)"
-            run.say(f"page: python -m http.server --directory {output}, then http://localhost:8000{query}")
+            run.say(
+                f"page: python -m http.server --directory {output}, then http://localhost:8000{query}"
+            )
         peak = {"peak_rss_bytes": peak_rss_of_all()} if tiled else {}
         run.say(f"{output}: {plural(len(levels.reports), 'level')}, {written / 1e6:.2f} MB")
         run.result({"output": str(output), "bytes": written, "levels": levels.reports, **peak})
@@ -248,7 +262,9 @@ def _tell_costs(run: Run, job: LevelsJob) -> None:
             continue
         cost = job.cost_of(count, size)
         steps = f", {describe_steps(cost)}" if job.job.recovers else ""
-        run.answer(f"level {number}: {plural(count, 'Gaussian')}{steps}: roughly {describe_memory(cost)}")
+        run.answer(
+            f"level {number}: {plural(count, 'Gaussian')}{steps}: roughly {describe_memory(cost)}"
+        )
         levels.append({"level": number, "count": count, **asdict(cost)})
     most = max((one["bytes"] for one in levels), default=0)
     run.answer(f"all levels: roughly {most / 1e6:,.0f} MB")

@@ -31,7 +31,9 @@ def poses(
     fov: Annotated[
         float | None,
         typer.Option(
-            min=1, max=170, help="Horizontal field of view, degrees; by default 50, and 70 in rooms."
+            min=1,
+            max=170,
+            help="Horizontal field of view, degrees; by default 50, and 70 in rooms.",
         ),
     ] = None,
     up: UpOption = None,
@@ -59,10 +61,14 @@ def poses(
     )
     splits = splits_of(None, pool.cameras.names)
     run.write_views(output, pool.cameras, format, splits)
-    run.say(f"{output}: {plural(looks, 'pose')}, {pool.kind} ({pool.why}; up is {direction(pool.up)})")
+    run.say(
+        f"{output}: {plural(looks, 'pose')}, {pool.kind} ({pool.why}; up is {direction(pool.up)})"
+    )
     shares = (("is in no view", pool.unseen), ("is smaller than a pixel in all views", pool.coarse))
     if told := [
-        f"{share:.0%} of the scene {what}" for what, share in shares if share > _LEAST_REPORTED_SHARE
+        f"{share:.0%} of the scene {what}"
+        for what, share in shares
+        if share > _LEAST_REPORTED_SHARE
     ]:
         run.say("; ".join(told))
     run.result(

@@ -26,7 +26,9 @@ _FIELDS = "schedule steps recovery_time sh_degree engine background seed"
 )
 def recover(
     run: Run,
-    student: Annotated[Path, typer.Argument(metavar="STUDENT", help="Simplified scene to recover.")],
+    student: Annotated[
+        Path, typer.Argument(metavar="STUDENT", help="Simplified scene to recover.")
+    ],
     output: opt.OutputOption,
     views: opt.ViewsOrMadeOption = None,
     images: opt.ImagesOption = None,
@@ -35,14 +37,18 @@ def recover(
     photos: opt.PhotosOption = False,
     anchors: Annotated[
         Path | None,
-        typer.Option(metavar="SCENE", help="The student before any recovery, if it was recovered before."),
+        typer.Option(
+            metavar="SCENE", help="The student before any recovery, if it was recovered before."
+        ),
     ] = None,
     preset: opt.PresetOption = "auto",
     resume: opt.ResumeOption = False,
     split: opt.SplitOption = "train",
     weighted: Annotated[
         bool | None,
-        typer.Option("--weights/--no-weights", help="Sample views by their weights, if they have any."),
+        typer.Option(
+            "--weights/--no-weights", help="Sample views by their weights, if they have any."
+        ),
     ] = None,
     size: opt.SizeOption = None,
     background: opt.BackgroundOption = None,
@@ -54,7 +60,11 @@ def recover(
     from g2ard.rendering.targets import kinds_of
     from g2ard.report.run import COLUMNS, describe_loss, list_cells
     from g2ard.stages.recover.config import RecoverConfig
-    from g2ard.stages.recover.report import describe_idle_regularizers, describe_outcome, describe_time_limit
+    from g2ard.stages.recover.report import (
+        describe_idle_regularizers,
+        describe_outcome,
+        describe_time_limit,
+    )
 
     if teacher is not None and not photos:
         run.refuse_typed("with --teacher, unless --photos is given", "alpha")
@@ -100,7 +110,9 @@ def recover(
             pixels = job.held_out.cameras.size_text
             title = f"held-out views against {kinds_of(job.held_out)}, {pixels}, start → result:"
             run.console.table(title, list(COLUMNS), list_cells(kinds))
-        for line in filter(None, (describe_loss(kind, "the student is better there") for kind in kinds)):
+        for line in filter(
+            None, (describe_loss(kind, "the student is better there") for kind in kinds)
+        ):
             run.say(line)
     gain = result.report.psnr
     count = plural(len(job.student), "Gaussian")

@@ -44,7 +44,8 @@ def register(
     output: opt.OutputOption,
     format: opt.ViewFormatOption = None,
     poses: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Initial poses: views in any format, or ACE text.")
+        Path | None,
+        typer.Option(metavar="FILE", help="Initial poses: views in any format, or ACE text."),
     ] = None,
     pool: Annotated[
         str | None,
@@ -56,21 +57,31 @@ def register(
     ] = None,
     intrinsics: Annotated[
         Path | None,
-        typer.Option(metavar="VIEWS", help="Intrinsics for a folder of photos: by name, or one for all."),
+        typer.Option(
+            metavar="VIEWS", help="Intrinsics for a folder of photos: by name, or one for all."
+        ),
     ] = None,
     focal: Annotated[
         float | None,
         typer.Option(
-            metavar="PX", min=1, help="Focal length for a folder of photos, pixels; by default their EXIF's."
+            metavar="PX",
+            min=1,
+            help="Focal length for a folder of photos, pixels; by default their EXIF's.",
         ),
     ] = None,
     keep: Annotated[
-        Keep, typer.Option(help="Photos to write; with all, photos without a pose keep their initial one.")
+        Keep,
+        typer.Option(
+            help="Photos to write; with all, photos without a pose keep their initial one."
+        ),
     ] = "registered",
     truth: Annotated[
-        Path | None, typer.Option(metavar="VIEWS", help="True poses to compare with; not used otherwise.")
+        Path | None,
+        typer.Option(metavar="VIEWS", help="True poses to compare with; not used otherwise."),
     ] = None,
-    split: Annotated[str, typer.Option(metavar="train|test|all", help="Split of --images VIEWS.")] = "all",
+    split: Annotated[
+        str, typer.Option(metavar="train|test|all", help="Split of --images VIEWS.")
+    ] = "all",
     report: Annotated[
         Path | None,
         typer.Option(metavar="FILE.html", help="Also write a page of renders overlaid on photos."),
@@ -141,7 +152,11 @@ def register(
                 overwrite=run.overwrite,
             )
     written = str(output) if len(found.cameras) else None
-    result = {**found.report.as_dict(), "summary": {"photos": len(rows), **counts}, "output": written}
+    result = {
+        **found.report.as_dict(),
+        "summary": {"photos": len(rows), **counts},
+        "output": written,
+    }
     run.result({**result, "settings": listed(config)})
     if not len(found.cameras):
         first = next(row for row in rows if row.status != "registered")

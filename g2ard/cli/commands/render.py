@@ -54,7 +54,9 @@ def render(
     images: opt.ImagesOption = None,
     turn: Annotated[
         int | None,
-        typer.Option("--orbit", min=1, metavar="N", help="Render N views on a circle around the scene."),
+        typer.Option(
+            "--orbit", min=1, metavar="N", help="Render N views on a circle around the scene."
+        ),
     ] = None,
     around: Annotated[
         bool,
@@ -66,7 +68,9 @@ def render(
     fps: Annotated[float, typer.Option(min=0.1, help="Images a second of an animation.")] = 25.0,
     sheet: Annotated[
         Path | None,
-        typer.Option(parser=opt.picture, metavar="FILE.png", help="Write all views as one contact sheet."),
+        typer.Option(
+            parser=opt.picture, metavar="FILE.png", help="Write all views as one contact sheet."
+        ),
     ] = None,
     depth: Annotated[
         bool,
@@ -75,7 +79,8 @@ def render(
         ),
     ] = False,
     looks: Annotated[
-        int | None, typer.Option("-k", min=1, metavar="K", help="Views to generate; by default 128.")
+        int | None,
+        typer.Option("-k", min=1, metavar="K", help="Views to generate; by default 128."),
     ] = None,
     convention: opt.ConventionOption = "gsplat",
     split: opt.SplitOption = "all",
@@ -111,7 +116,9 @@ def render(
 
     def check_single(count: int) -> None:
         if file is not None and single and count > 1:
-            raise typer.BadParameter(f"-o: {file.name} holds one view, not {count}; give -k 1 or a folder")
+            raise typer.BadParameter(
+                f"-o: {file.name} holds one view, not {count}; give -k 1 or a folder"
+            )
 
     check_single(turn or looks or 1)
     if looks is not None and is_given(views):
@@ -132,7 +139,11 @@ def render(
     else:
         beside = None if is_made(views) else scene
         given = GivenViews(views, beside, up, run.seed, choose_plan_size(size), **run.callbacks)
-        found = find_or_plan_views(splats, given) if looks is None else choose_looks(splats, looks, given)
+        found = (
+            find_or_plan_views(splats, given)
+            if looks is None
+            else choose_looks(splats, looks, given)
+        )
     cameras = load_views(found, split, None, run.say)
     if around:
         cameras = stations(cameras)
@@ -147,7 +158,12 @@ def render(
     shown: list[Bytes] = []
     colour = opt.background_of(run, background, scene) or BLACK
     generated = turn is not None or looks is not None or is_planned(found)
-    sky = generated and colour == BLACK and background is None and choose_backdrop(None, [splats]) is None
+    sky = (
+        generated
+        and colour == BLACK
+        and background is None
+        and choose_backdrop(None, [splats]) is None
+    )
     renderer = Renderer(splats, background=colour, settings=RasterSettings(convention=convention))
 
     def draw(folder: Path | None) -> Iterator[Bytes]:
@@ -155,14 +171,18 @@ def render(
             camera = cameras[view]
             rendered: Rendered | None = None
             if around:
-                rendered = renderer.panorama(camera, width=2 * max(2, (size[0] if size else _PANORAMA) // 2))
+                rendered = renderer.panorama(
+                    camera, width=2 * max(2, (size[0] if size else _PANORAMA) // 2)
+                )
             elif depth or sky:
                 rendered = renderer.render(camera)
             image = renderer.image(camera) if rendered is None else rendered.image
             if rendered is not None and sky:
                 image = seen_on_sky(rendered)
             if folder is not None:
-                _write_view(folder / places[view], image, rendered.depth if rendered and depth else None)
+                _write_view(
+                    folder / places[view], image, rendered.depth if rendered and depth else None
+                )
             pixels = to_bytes(image)
             if sheet is not None:
                 shown.append(pixels)
@@ -198,7 +218,9 @@ def _check_output(run: Run, output: Path | None, depth: bool) -> tuple[Path | No
     run.claim("--output", output)
     if output.suffix.lower() not in (".png", *ANIMATIONS):
         if output.suffix.lower() in _NO_FOLDER:
-            raise typer.BadParameter(f"-o: expected a folder, .png, .gif, .webp or .mp4, got {output.name!r}")
+            raise typer.BadParameter(
+                f"-o: expected a folder, .png, .gif, .webp or .mp4, got {output.name!r}"
+            )
         check_output(output, run.overwrite, folder=True)
         return output, None
     if depth:
@@ -235,4 +257,6 @@ def _write_sheet(path: Path, images: list[Bytes], names: tuple[str, ...], overwr
     columns = math.ceil(math.sqrt(len(images)))
     rows = [images[i : i + columns] for i in range(0, len(images), columns)]
     captions = [", ".join(names[i : i + columns]) for i in range(0, len(images), columns)]
-    write_png(path, draw_contact_sheet(rows, [""] * columns, row_labels=captions), overwrite=overwrite)
+    write_png(
+        path, draw_contact_sheet(rows, [""] * columns, row_labels=captions), overwrite=overwrite
+    )

@@ -121,7 +121,9 @@ def _write(
     import numpy as np
 
     kept = np.isin(np.arange(len(pool.splits)), chosen)
-    held_out = [i for i, word in enumerate(pool.splits) if word not in ("train", None) and not kept[i]]
+    held_out = [
+        i for i, word in enumerate(pool.splits) if word not in ("train", None) and not kept[i]
+    ]
     rows = np.array([*chosen, *held_out], int)
     run.write_views(
         output,

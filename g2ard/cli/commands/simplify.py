@@ -56,7 +56,9 @@ def simplify(
     output: opt.OutputOption,
     parents: Annotated[
         Path | None,
-        typer.Option(metavar="FILE.npy", help="Also write each Gaussian's row in the result, or -1."),
+        typer.Option(
+            metavar="FILE.npy", help="Also write each Gaussian's row in the result, or -1."
+        ),
     ] = None,
     dry_run: opt.DryRunOption = False,
 ) -> None:
@@ -84,7 +86,12 @@ def simplify(
     if config.method == "paper":
         run.refuse_typed("on the method paper", "views", "images")
     given_views = is_given(views)
-    if given_views or no_views or config.method == "paper" or (config.method == "fast" and views is None):
+    if (
+        given_views
+        or no_views
+        or config.method == "paper"
+        or (config.method == "fast" and views is None)
+    ):
         run.refuse_typed("without generated views", "up")
     source = Source(scene, run.render_model, others or ())
     opt.choose_points(run, source)
@@ -147,7 +154,11 @@ def simplify(
                 ):
                     np.save(file, read_parents(small, source))
             written = time.perf_counter()
-            seconds = {"read": reading, "simplify": simplified - started, "write": written - simplified}
+            seconds = {
+                "read": reading,
+                "simplify": simplified - started,
+                "write": written - simplified,
+            }
             seconds["total"] = sum(seconds.values())
             started = written
             warnings = reduce.warnings(small.splats)
@@ -179,7 +190,9 @@ def _tell_plan(run: Run, reduce: Reduction, counts: Sequence[int]) -> None:
     for count in counts:
         cost = cost_of_reduction(reduce, count)
         views = plural(cost.views, "view")
-        run.answer(f"{plural(count, 'Gaussian')}, weighed in {views}: roughly {describe_memory(cost)}")
+        run.answer(
+            f"{plural(count, 'Gaussian')}, weighed in {views}: roughly {describe_memory(cost)}"
+        )
         told = {"count": count, "views": cost.views, "bytes": cost.bytes}
         plans.append({**told, **count_tiles(reduce.plan)})
     run.say_dry()
@@ -198,7 +211,9 @@ def _tell_result(
         run.say(f"note: no view sees {share:.0%} of the Gaussians; they are weighted by size only")
     say_gaps(small.report.opacity_lost, run.say)
     say_weight(run, source.path, output, reduce.splats)  # a sample has as much SH
-    run.say(f"{output}: {len(small.splats):,} of {count_content(reduce.total, source)} in {seconds:.1f} s")
+    run.say(
+        f"{output}: {len(small.splats):,} of {count_content(reduce.total, source)} in {seconds:.1f} s"
+    )
 
 
 def _print_rounds(run: Run, small: Merged) -> None:

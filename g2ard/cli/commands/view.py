@@ -19,7 +19,9 @@ _LARGEST_DENSE = 2_000_000
 """Largest dense scene that is shown beside a run's result."""
 
 
-@command("view", example="g2ard view dense.ply run/ -o compare.html", scenes=True, without=("seed",))
+@command(
+    "view", example="g2ard view dense.ply run/ -o compare.html", scenes=True, without=("seed",)
+)
 def view(
     run: Run,
     scene: Annotated[
@@ -39,7 +41,10 @@ def view(
     output: Annotated[
         Path | None,
         typer.Option(
-            "-o", "--output", metavar="FILE.html", help="Write the page here, instead of opening the browser."
+            "-o",
+            "--output",
+            metavar="FILE.html",
+            help="Write the page here, instead of opening the browser.",
         ),
     ] = None,
     views: opt.ViewsOrMadeOption = None,
@@ -109,7 +114,8 @@ def _write(
     sources = [Source(path, run.render_model) for path in shown]
     loaded = [run.load(source) for source in sources]
     if views is None and scene.is_dir() and (own := scene / "views.json").is_file():
-        views = own if any(read_views(own).image_paths) else "made"  # generated ones show what trains
+        # generated ones show what trains
+        views = own if any(read_views(own).image_paths) else "made"
     stand = choose_frame(loaded[0], GivenViews(views, sources[0].file, up, say=run.say), start)
     labels = label_scenes(sources, [len(splats) for splats in loaded], roles)
     known = opt.background_of(run, background, scene, other)

@@ -33,7 +33,9 @@ _HIDING = 200_000
 _UNCOLORED_NOTES = ("grey", "black", "black_points")
 
 
-def colored(cloud: Cloud, train: Cameras, name: str, *, progress: Progress = silent, say: Say) -> Points:
+def colored(
+    cloud: Cloud, train: Cameras, name: str, *, progress: Progress = silent, say: Say
+) -> Points:
     """Return a cloud's points, those without a colour with that of training photos, where any sees them."""
     points = cloud.points
     bare = ~cloud.colored
@@ -83,7 +85,11 @@ class ColoredStream(PointStream):
         return super().__getstate__()
 
     def identity(self) -> list[Any]:
-        photos = [path for path in (*self._photos.image_paths, *self._photos.mask_paths) if path is not None]
+        photos = [
+            path
+            for path in (*self._photos.image_paths, *self._photos.mask_paths)
+            if path is not None
+        ]
         return [self._bare.identity(), key_of(self._photos), file_identity(photos)]
 
     def absolute(self) -> Self:
@@ -164,7 +170,9 @@ def median_colors(
         progress("colour points", done, len(cameras))
         few = np.flatnonzero(count < _SEEN)
         if hiding is None:
-            pixels, visible = (found[own[few]] for found in _find_seen(positions, positions, cameras, view))
+            pixels, visible = (
+                found[own[few]] for found in _find_seen(positions, positions, cameras, view)
+            )
         else:
             pixels, visible = _find_seen(positions[own[few]], hiding, cameras, view)
         u, v = pixels[visible].T

@@ -52,7 +52,9 @@ class VisualHull:
         return np.linspace(max(depth.min(), 1e-3 * farthest), farthest, count)
 
 
-def visual_hull(cameras: Cameras, outlines: Sequence[Mask | None], middle: Float) -> VisualHull | None:
+def visual_hull(
+    cameras: Cameras, outlines: Sequence[Mask | None], middle: Float
+) -> VisualHull | None:
     """Carve away every voxel that photos show to be empty.
 
     Args:
@@ -61,7 +63,9 @@ def visual_hull(cameras: Cameras, outlines: Sequence[Mask | None], middle: Float
 
     Returns None if nothing remains, or the object is not outlined in enough views.
     """
-    told = [v for v, outline in enumerate(outlines) if outline is not None and not bool(outline.all())]
+    told = [
+        v for v, outline in enumerate(outlines) if outline is not None and not bool(outline.all())
+    ]
     if len(told) < max(3, _SEEING_VIEWS_SHARE * len(cameras)):
         return None
     half = float(np.median(np.linalg.norm(cameras.positions - middle, axis=1)))

@@ -57,14 +57,21 @@ def distinct(points: Points) -> Points:
     """Merge points of one position, as lifting does, so that what is missing can be counted."""
     if not len(points):
         return points
-    rows, colors = merge_equal(points.positions - np.median(points.positions, axis=0), points.colors)
+    rows, colors = merge_equal(
+        points.positions - np.median(points.positions, axis=0), points.colors
+    )
     if len(rows) == len(points):
         return points
     return Points(points.positions[rows], np.ascontiguousarray(colors, np.float32))
 
 
 def points_along_rays(
-    cameras: Cameras, count: int, *, background: Colour = BLACK, seed: int = 0, progress: Progress = silent
+    cameras: Cameras,
+    count: int,
+    *,
+    background: Colour = BLACK,
+    seed: int = 0,
+    progress: Progress = silent,
 ) -> Points:
     """Place points on the rays of random pixels, where nearby photos agree best on the colour.
 
@@ -85,10 +92,13 @@ def points_along_rays(
             f"points along camera rays need 3 training views; there are {len(cameras)}",
             hint="pass more photos, a point cloud or a scene",
         )
-    bare = [name for name, path in zip(cameras.names, cameras.image_paths, strict=True) if path is None]
+    bare = [
+        name for name, path in zip(cameras.names, cameras.image_paths, strict=True) if path is None
+    ]
     if bare:
         raise InputError(
-            f"view {bare[0]} has no photo", hint="pass views with photos, their {images=DIR}, or a scene"
+            f"view {bare[0]} has no photo",
+            hint="pass views with photos, their {images=DIR}, or a scene",
         )
     photos: list[_Photo] = []
     outlines: list[Mask | None] = []
@@ -120,7 +130,9 @@ def points_along_rays(
         columns = rng.integers(starts.shape[1], size=some)
         pixels = np.stack([rows, columns])[:, starts[rows, columns]]
         if hull is None:
-            depths = distances[view] / np.linspace(1 / _NEAREST_DEPTH, 1 / _FARTHEST_DEPTH, _TRIAL_DEPTHS)
+            depths = distances[view] / np.linspace(
+                1 / _NEAREST_DEPTH, 1 / _FARTHEST_DEPTH, _TRIAL_DEPTHS
+            )
         else:
             depths = hull.depths(cameras, view, _HULL_DEPTHS)
         slack = 2.0 ** (tried // (_RAYS_PER_DOUBLING * max(count, _RAYS)))
@@ -176,15 +188,21 @@ class _Photo:
     step: int
 
     @classmethod
-    def of(cls, image: Float32, mask: Mask | None, outline: Mask | None, background: Colour) -> _Photo:
+    def of(
+        cls, image: Float32, mask: Mask | None, outline: Mask | None, background: Colour
+    ) -> _Photo:
         step = max(1, round(max(image.shape) / _PATCH_SPACING))
-        shown = np.abs(image - background).max(2) > _EMPTY_COLOUR_SLACK if outline is None else outline
+        shown = (
+            np.abs(image - background).max(2) > _EMPTY_COLOUR_SLACK if outline is None else outline
+        )
         if mask is None:
             return cls(image, np.ones_like(shown), shown, step)
         return cls(image, mask, shown & ~grown(~mask, step), step)
 
 
-def _sweep(ray: _Rays, depths: Float, hull: VisualHull | None, slack: float) -> tuple[Float, Float32]:
+def _sweep(
+    ray: _Rays, depths: Float, hull: VisualHull | None, slack: float
+) -> tuple[Float, Float32]:
     """Return points on rays, with colours.
 
     Points lie within the hull if there is one. Without one, a point must agree with other photos, and

@@ -74,7 +74,9 @@ class Regularizers(Settings):
         (0.1, 0.001)
         """
         kind = name.removeprefix("paper-")
-        return cls.of("trained" if kind in ("auto", "paper") else kind, paper=name.startswith("paper"))
+        return cls.of(
+            "trained" if kind in ("auto", "paper") else kind, paper=name.startswith("paper")
+        )
 
     @property
     def active(self) -> bool:
@@ -258,7 +260,11 @@ def _carry_depths(
 
 
 def choose_regularizers(
-    given: Regularizers | str | None, prior: Splats, cameras: Cameras | None = None, *, paper: bool = False
+    given: Regularizers | str | None,
+    prior: Splats,
+    cameras: Cameras | None = None,
+    *,
+    paper: bool = False,
 ) -> tuple[Regularizers, str, PriorMeasures]:
     """Return the value of the setting `recover.regularizers`: as given, by name, or by measuring the prior.
 
@@ -281,7 +287,9 @@ def choose_regularizers(
     name = given or "auto"
     kind = {"paper": "auto"}.get(name, name.removeprefix("paper-"))
     if kind != "auto" and kind not in REGULARIZERS:
-        raise InputError(f"expected auto, paper, {', '.join(REGULARIZERS)}, got {name!r}", parameter="preset")
+        raise InputError(
+            f"expected auto, paper, {', '.join(REGULARIZERS)}, got {name!r}", parameter="preset"
+        )
     paper = paper or name.startswith("paper")
     measures = measure_prior(prior, cameras)
     kind, why = (kind, "as requested") if kind != "auto" else _judge(measures)
@@ -292,7 +300,10 @@ def choose_regularizers(
 def _judge(m: PriorMeasures) -> tuple[str, str]:
     needles = f"{m.needle:.1%} of the Gaussians are needles"
     if m.is_lift:
-        return "lift", "thin discs of equal proportions and colours without view dependence: not trained yet"
+        return (
+            "lift",
+            "thin discs of equal proportions and colours without view dependence: not trained yet",
+        )
     if m.needle > _MANY_NEEDLES:
         return "noisy", needles
     if m.consistency is None:

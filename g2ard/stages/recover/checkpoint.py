@@ -35,10 +35,15 @@ def save(
     """
     text = json.dumps({"key": key, **meta}, default=plain)
     everything = {"meta": np.array(text), **arrays}
-    with atomic_output(path, overwrite=True) as temporary, zipfile.ZipFile(temporary, "w") as archive:
+    with (
+        atomic_output(path, overwrite=True) as temporary,
+        zipfile.ZipFile(temporary, "w") as archive,
+    ):
         for name, array in everything.items():
             with archive.open(f"{name}.npy", "w", force_zip64=True) as file:
-                np.lib.format.write_array(file, array() if callable(array) else array, allow_pickle=False)
+                np.lib.format.write_array(
+                    file, array() if callable(array) else array, allow_pickle=False
+                )
 
 
 def load(path: Path, key: str) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -67,7 +72,9 @@ def drop_damaged(path: Path) -> None:
     """Remove a checkpoint that cannot be read, such as one that a power cut left half-written."""
     try:
         with np.load(path) as data:
-            whole = "key" in json.loads(str(data["meta"])) and all(data[name] is not None for name in data)
+            whole = "key" in json.loads(str(data["meta"])) and all(
+                data[name] is not None for name in data
+            )
     except FileNotFoundError:
         return
     except Exception:  # as `load`
@@ -102,7 +109,8 @@ def defer_interrupt() -> Iterator[threading.Event]:
         asked.set()
 
     numbers = [signal.SIGINT]
-    if signal.getsignal(signal.SIGTERM) is interrupt.terminate:  # otherwise it is the caller's own handler
+    # otherwise it is the caller's own handler
+    if signal.getsignal(signal.SIGTERM) is interrupt.terminate:
         numbers.append(signal.SIGTERM)
     before = [(number, signal.signal(number, note)) for number in numbers]
     try:

@@ -161,7 +161,9 @@ class Schedule(Settings):
         rounds = max(1, round(self.round_steps * share)) if self.round_steps else 0
         return replace(self, steps=steps, round_steps=rounds)
 
-    def at(self, t: float, *, final: bool, multiplier: float = 1.0, reach: float = math.inf) -> Rates:
+    def at(
+        self, t: float, *, final: bool, multiplier: float = 1.0, reach: float = math.inf
+    ) -> Rates:
         """Return the rates at the share `t` of the steps, from 0 at the first to 1 after the last."""
         fall = 1.0 if self.final_rate is None else 1 - (1 - self.final_rate) * t
         decay = self.appearance_decay[1 if final else 0] ** t
@@ -182,13 +184,17 @@ class Schedule(Settings):
 
 
 TUNED = Schedule(
-    rates=Rates(means=0.05, log_scales=6e-2, quats=1.5e-2, logit_opacities=7e-2, sh0=3e-2, shN=3e-3),
+    rates=Rates(
+        means=0.05, log_scales=6e-2, quats=1.5e-2, logit_opacities=7e-2, sh0=3e-2, shN=3e-3
+    ),
     steps=1000,
 )
 """g2ard's schedule: rates in units of each Gaussian, falling to 1 % (figures in decisions 0016 and 0037)."""
 
 PAPER = Schedule(
-    rates=Rates(means=9.2e-4, log_scales=5e-3, quats=1e-3, logit_opacities=5e-3, sh0=2.5e-3, shN=1.25e-4),
+    rates=Rates(
+        means=9.2e-4, log_scales=5e-3, quats=1e-3, logit_opacities=5e-3, sh0=2.5e-3, shN=1.25e-4
+    ),
     steps=30_000,
     round_steps=8_000,
     means_in_scales=False,
@@ -319,7 +325,9 @@ class RecoverConfig(FitConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.steps is not None and self.recovery_time is not None:
-            raise InputError("steps and recovery_time exclude each other; give one", parameter="steps")
+            raise InputError(
+                "steps and recovery_time exclude each other; give one", parameter="steps"
+            )
 
     @property
     def horizon(self) -> int:

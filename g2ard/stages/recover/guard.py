@@ -129,7 +129,9 @@ class Guard:
         before = self.validation[0]["psnr"]
         return min(scores[kind] - before[kind] for kind in before)
 
-    def choose_by_validation(self, result: Splats, views: Float, step: int) -> tuple[Splats, float | None]:
+    def choose_by_validation(
+        self, result: Splats, views: Float, step: int
+    ) -> tuple[Splats, float | None]:
         """Decide how much of a result's changes to keep, by the validation views.
 
         Each Gaussian's change is multiplied by v/(v + k), where v `views` touched it (shrinkage towards the
@@ -173,7 +175,9 @@ class Guard:
         """Return the mean PSNR over training views, `trained`, and the kinds of validation views."""
         return (trained + sum(scores.values())) / (1 + len(scores))
 
-    def _find_least_harm(self, result: Splats, views: Float) -> tuple[Splats, float | None, dict[str, float]]:
+    def _find_least_harm(
+        self, result: Splats, views: Float
+    ) -> tuple[Splats, float | None, dict[str, float]]:
         """Return the candidate whose worst kind of validation views gains most, its k and its scores."""
         assert self.others is not None
         best = self.start
@@ -250,4 +254,6 @@ def blend(start: Splats, end: Splats, share: ArrayLike) -> Splats:
         mixed.append((a + weights * (b - a)).astype(np.float32))
     means, quats, log_scales, logits, sh0, shN = mixed
     scales = np.exp(log_scales.astype(np.float64)).astype(np.float32)
-    return Splats(means, quats, scales, logits, sh0, shN, end.offset, end.render_model, end.up, end.axes)
+    return Splats(
+        means, quats, scales, logits, sh0, shN, end.offset, end.render_model, end.up, end.axes
+    )

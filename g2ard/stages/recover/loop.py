@@ -166,14 +166,20 @@ class Loop:
             self.multiplier = schedule.multiplier
             return
         self.multiplier = guess_multiplier(rmse)
-        if kinds_of(self.targets) == RENDERS and limit is None and self.multiplier > min(MULTIPLIERS):
+        if (
+            kinds_of(self.targets) == RENDERS
+            and limit is None
+            and self.multiplier > min(MULTIPLIERS)
+        ):
             return
         if steps := count_trial_steps(self.config.horizon, limit):
             tight = choose_reach(0.0, typical) if schedule.reach is None else self.reach
             with checkpoints.defer_interrupt() as interrupted:
                 trials = Trials(partial(self._trial, steps, interrupted), start, limit)
                 self._choose_by_trials(trials, rmse, tight)
-            self.trials = [{"multiplier": m, "psnr": value} for m, value in sorted(trials.scores.items())]
+            self.trials = [
+                {"multiplier": m, "psnr": value} for m, value in sorted(trials.scores.items())
+            ]
             self.seconds = trials.seconds
 
     def _choose_by_trials(self, trials: Trials, rmse: float, tight: float) -> None:
@@ -209,16 +215,26 @@ class Loop:
             return self._trial(steps, interrupted, multiplier, end)
 
     def _learn(
-        self, engine: Engine, step: int, share: float, multiplier: float, *, regularize: bool = False
+        self,
+        engine: Engine,
+        step: int,
+        share: float,
+        multiplier: float,
+        *,
+        regularize: bool = False,
     ) -> float:
         """Advance an engine by the view of this step, with the rates at this share of the horizon."""
-        rates = self.schedule.at(share, final=self.config.final, multiplier=multiplier, reach=self.reach)
+        rates = self.schedule.at(
+            share, final=self.config.final, multiplier=multiplier, reach=self.reach
+        )
         view = self._view(step)
         if self.exposures is None:
             target = self.targets[view]
             mask = mask_of(self.targets, view)
         else:
-            target, mask = unexposed(self.targets, view, self.exposures[view], self.config.background)
+            target, mask = unexposed(
+                self.targets, view, self.exposures[view], self.config.background
+            )
         fixed = self.exposures is None
         return engine.step(view, target, rates, regularize=regularize, mask=mask, fixed=fixed)
 
@@ -261,7 +277,9 @@ class Loop:
         first = int(backed_off[-1]["step"]) if backed_off else 0
         return self.engine.counts * (len(self.targets.cameras) / max(1, self.done - first))
 
-    def _run(self, checkpoint: Path | None, progress: Progress, stage: str, watch: Watch | None) -> None:
+    def _run(
+        self, checkpoint: Path | None, progress: Progress, stage: str, watch: Watch | None
+    ) -> None:
         """Take the remaining steps."""
         earlier = self.seconds
         began = time.monotonic()
@@ -279,7 +297,9 @@ class Loop:
                     paused = time.monotonic()
                     watch(self.done, self.seconds, self.engine.splats)
                     began += time.monotonic() - paused
-                if checkpoint is not None and (interrupted.is_set() or now - saved > checkpoints.PERIOD):
+                if checkpoint is not None and (
+                    interrupted.is_set() or now - saved > checkpoints.PERIOD
+                ):
                     self._save(checkpoint)
                     saved = now
                 if interrupted.is_set():
@@ -296,7 +316,9 @@ class Loop:
         step = self.done
         regularize = config.regularizers.active and (step + 1) % config.regularizers.period == 0
         began = time.monotonic()
-        loss = self._learn(self.engine, step, self._measure_share(), self.multiplier, regularize=regularize)
+        loss = self._learn(
+            self.engine, step, self._measure_share(), self.multiplier, regularize=regularize
+        )
         self.losses.append(loss)
         tally = self.tally[regularize]
         tally[0] += 1
@@ -336,14 +358,21 @@ class Loop:
         """Log Drift95 and Needle at every tenth of the recovery."""
         if len(self.geometry) < int(min(1.0, self._measure_share()) * _LOG_POINTS):
             scene = self.engine.splats()
-            figures = {"drift95": drift95(self.anchors, scene.means), "needle": needle_share(scene.scales)}
+            figures = {
+                "drift95": drift95(self.anchors, scene.means),
+                "needle": needle_share(scene.scales),
+            }
             self.geometry.append({"step": self.done, **figures})
 
     @property
     def regularizers(self) -> Regularized:
         """Steps and cost of the regularisers."""
         (plain, plain_seconds), (regularized, regularized_seconds) = self.tally
-        extra = regularized_seconds - regularized * plain_seconds / plain if plain and regularized else 0.0
+        extra = (
+            regularized_seconds - regularized * plain_seconds / plain
+            if plain and regularized
+            else 0.0
+        )
         share = max(0.0, extra) / max(plain_seconds + regularized_seconds, 1e-9)
         weights = self.config.regularizers
         return Regularized(int(regularized), share, weights.period if weights.active else 0)
@@ -362,7 +391,9 @@ class Loop:
 
     def curve(self) -> list[float]:
         """Return up to 100 means of the loss over equal parts of the recovery."""
-        return [float(part.mean()) for part in np.array_split(np.array(self.losses), 100) if len(part)]
+        return [
+            float(part.mean()) for part in np.array_split(np.array(self.losses), 100) if len(part)
+        ]
 
     def _view(self, step: int) -> int:
         """Return the view of a step; each epoch has a new random order, see `draw_views`."""
@@ -374,7 +405,9 @@ class Loop:
 
     def _meta(self) -> dict[str, Any]:
         """Return everything that a checkpoint stores besides arrays."""
-        return {name: getattr(self, name) for name in _CHECKPOINT_FIELDS} | {"guard": self.guard.meta()}
+        return {name: getattr(self, name) for name in _CHECKPOINT_FIELDS} | {
+            "guard": self.guard.meta()
+        }
 
     def _save(self, path: Path) -> None:
         arrays = {**self.engine.state(), "losses": np.array(self.losses), **self.guard.arrays()}
@@ -423,10 +456,17 @@ def check_weights(weights: ArrayLike | None, count: int) -> Float | None:
     if weights is None:
         return None
     values = np.asarray(weights, np.float64)
-    require("weights", f"shape {values.shape}", values.shape == (count,), f"{count} weights, one per view")
+    require(
+        "weights",
+        f"shape {values.shape}",
+        values.shape == (count,),
+        f"{count} weights, one per view",
+    )
     bad = np.flatnonzero(~(np.isfinite(values) & (values >= 0)))
     if len(bad):
-        raise InputError(f"view {bad[0]}: {values[bad[0]]} is not a number ≥ 0", parameter="weights")
+        raise InputError(
+            f"view {bad[0]}: {values[bad[0]]} is not a number ≥ 0", parameter="weights"
+        )
     if not values.any():
         raise InputError("all are zero, so no view can be drawn", parameter="weights")
     values = values / values.max()  # their sum must not overflow

@@ -68,7 +68,9 @@ def build_rotations(quats: Tensor) -> Tensor:
 
 class _L1Ssim(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, image: Tensor, target: Tensor, ssim_weight: float, mask: Tensor | None) -> Tensor:
+    def forward(
+        ctx: Any, image: Tensor, target: Tensor, ssim_weight: float, mask: Tensor | None
+    ) -> Tensor:
         a, b = (t.detach().contiguous().numpy() for t in (image, target))
         counts = None if mask is None else mask.contiguous().numpy()
         loss, gradient = _core.l1_ssim(a, b, ssim_weight, counts)
@@ -81,7 +83,9 @@ class _L1Ssim(torch.autograd.Function):
         return gradient * grads[0], None, None, None
 
 
-def l1_ssim(image: Tensor, target: Tensor, ssim_weight: float = 0.2, mask: Tensor | None = None) -> Tensor:
+def l1_ssim(
+    image: Tensor, target: Tensor, ssim_weight: float = 0.2, mask: Tensor | None = None
+) -> Tensor:
     """Return (1 − λ)·L1 + λ·(1 − SSIM), means over pixels and channels (3DGS's loss with its λ = 0.2).
 
     SSIM is that of `g2ard.rendering.metrics.ssim`. Sums have a fixed order.
@@ -112,9 +116,13 @@ def anchor_loss(means: Tensor, anchors: Anchors) -> Tensor:
     return torch.log1p((squared - 1).clamp_min(0)).mean()
 
 
-def shape_loss(log_scales: Tensor, quats: Tensor, anchors: Anchors, weights: Regularizers) -> Tensor:
+def shape_loss(
+    log_scales: Tensor, quats: Tensor, anchors: Anchors, weights: Regularizers
+) -> Tensor:
     """Return (1/N) Σ max(0, −log(r_eff − 1 + ε)) + β[log s⊥ − log s̄⊥]₊, with s⊥ along the anchor's normal."""
-    normal, r_perp = (torch.from_numpy(a).to(quats) for a in (anchors.frames[:, :, 2], anchors.r_perp))
+    normal, r_perp = (
+        torch.from_numpy(a).to(quats) for a in (anchors.frames[:, :, 2], anchors.r_perp)
+    )
     extent = torch.einsum("nji,nj->ni", build_rotations(quats), normal) * log_scales.exp()
     thickness = extent.square().sum(1).clamp_min(1e-38).log() / 2 - r_perp.log()
     total = weights.thickness * thickness.clamp_min(0)

@@ -86,7 +86,9 @@ def recover(
     unit = unit_quats(student.quats)
     student = student if unit is student.quats else replace(student, quats=unit)
     if not len(student) or not len(targets.cameras):
-        raise InputError(f"nothing to recover: got {len(student)} Gaussians and {len(targets.cameras)} views")
+        raise InputError(
+            f"nothing to recover: got {len(student)} Gaussians and {len(targets.cameras)} views"
+        )
     if not targets.cameras.facing(student.positions).any():
         raise InputError(unseeing(targets.cameras, "the scene"))
     if frozen is not None and (config.engine != "fused" or frozen.shape != (len(student),)):
@@ -118,7 +120,16 @@ def recover(
     blend = 1.0
     seen = None
     loop = Loop(
-        student, targets, config, view_weights, anchors, probe, guard, validation_key, frozen, time_left
+        student,
+        targets,
+        config,
+        view_weights,
+        anchors,
+        probe,
+        guard,
+        validation_key,
+        frozen,
+        time_left,
     )
     if not exact:
         if checkpoint is None or not checkpoint.exists():

@@ -67,7 +67,9 @@ class Probe:
             self._scored = splats, float(np.mean(list(scores)))
         return self._scored[1]
 
-    def score_latest(self, splats: Callable[[], Splats], step: int, seconds: float) -> tuple[float, int]:
+    def score_latest(
+        self, splats: Callable[[], Splats], step: int, seconds: float
+    ) -> tuple[float, int]:
         """Return the mean PSNR and its step; the previous ones if scoring has used its share of the time.
 
         `splats` returns the current scene, after `step` steps and `seconds` of recovery.
@@ -75,7 +77,8 @@ class Probe:
         if seconds >= self._next:
             began = time.monotonic()
             self._latest = self.score(splats()), step
-            share = _SCORING_TIME_SHARE if self._next else _FIRST_SCORING_SHARE  # the start is outdated soon
+            # the start is outdated soon
+            share = _SCORING_TIME_SHARE if self._next else _FIRST_SCORING_SHARE
             self._next = seconds + (time.monotonic() - began) / share
         return self._latest
 
@@ -92,7 +95,8 @@ def score_by_kind(
     at most 40 dB."""
     rows = rows_by_kind(targets.cameras.kinds)
     probes = {
-        kind: Probe(Subset(targets, found), background, _INVISIBLE_PSNR) for kind, found in rows.items()
+        kind: Probe(Subset(targets, found), background, _INVISIBLE_PSNR)
+        for kind, found in rows.items()
     }
     return lambda splats: {kind: probe.score(splats) for kind, probe in probes.items()}
 
@@ -131,7 +135,11 @@ class _Comparison:
     """Squared errors of two scenes of the same Gaussians in some views, 0 where a view is masked."""
 
     def __init__(
-        self, start: Splats, result: Splats, targets: Targets, background: tuple[float, float, float]
+        self,
+        start: Splats,
+        result: Splats,
+        targets: Targets,
+        background: tuple[float, float, float],
     ) -> None:
         self._renderers = [Renderer(scene, background=background) for scene in (start, result)]
         self._targets = targets
@@ -153,7 +161,9 @@ class _Comparison:
 
     def lost(self, view: int) -> float:
         """Return a view's loss in dB."""
-        before, after = (max(float(error.mean(dtype=np.float64)), _LEAST_MSE) for error in self._errors(view))
+        before, after = (
+            max(float(error.mean(dtype=np.float64)), _LEAST_MSE) for error in self._errors(view)
+        )
         return 10 * math.log10(after / before)
 
     def light(self, view: int) -> Float32:

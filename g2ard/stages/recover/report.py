@@ -162,9 +162,7 @@ def describe_outcome(report: RecoverReport) -> str | None:
         return f"kept the start: {why}{given_up}"
     if lines:
         thirds = "a third" if len(lines) == 1 else f"1/{3 ** len(lines)}"
-        return (
-            f"recovery fell to {', '.join(lines)}: continued from the best scene with {thirds} of the rates"
-        )
+        return f"recovery fell to {', '.join(lines)}: continued from the best scene with {thirds} of the rates"
     if report.blend < 1:
         return (
             f"recovery lost PSNR in the training views; the result mixes {report.blend:.0%} of it with "
@@ -184,7 +182,12 @@ def describe_time_limit(report: RecoverReport) -> str | None:
     >>> describe_time_limit(full) is describe_time_limit(replace(full, planned=800)) is None
     True
     """
-    if report.planned is None or report.steps >= report.planned or report.kept_start or report.stopped:
+    if (
+        report.planned is None
+        or report.steps >= report.planned
+        or report.kept_start
+        or report.stopped
+    ):
         return None
     text = f"time ended recovery at step {report.steps:,} of {report.planned:,}"
     if report.pace is None:

@@ -94,7 +94,9 @@ class TorchEngine:
         splats = objective.start
         self._settings = objective.settings
         self._base = torch.from_numpy(splats.means.astype(np.float32))
-        unit = measure_radii(splats) if objective.means_in_scales else np.ones(len(splats), np.float32)
+        unit = (
+            measure_radii(splats) if objective.means_in_scales else np.ones(len(splats), np.float32)
+        )
         self._unit = torch.from_numpy(unit[:, None])
         start = {
             "means": np.zeros((len(splats), 3), np.float32),

@@ -36,7 +36,9 @@ class Trials:
         limit: time limit of the whole recovery, seconds; None is unlimited.
     """
 
-    def __init__(self, run: Callable[[float, float], float], start: float, limit: float | None) -> None:
+    def __init__(
+        self, run: Callable[[float, float], float], start: float, limit: float | None
+    ) -> None:
         self.scores: dict[float, float] = {}
         self.start = start
         self._run = run

@@ -137,7 +137,9 @@ def moves(shot: Shot, K: Float, xi: Float) -> float:
 
 def zoomed(camera: Camera, zoom: float, viewmat: Float) -> Camera:
     """Return the camera at a pose with its focal lengths multiplied by `zoom`."""
-    return replace(camera, K=camera.K * np.array([[zoom, 1, 1], [1, zoom, 1], [1, 1, 1]]), viewmat=viewmat)
+    return replace(
+        camera, K=camera.K * np.array([[zoom, 1, 1], [1, zoom, 1], [1, 1, 1]]), viewmat=viewmat
+    )
 
 
 def focal_alone(matrix: Float, right: Float, zoom: float) -> tuple[float, float]:
@@ -200,7 +202,9 @@ def _align_levels(
     for number, (camera, photo) in enumerate(pyramid):
         last = number == len(pyramid) - 1
         still = config.still if last else _COARSE_STILL_FACTOR * config.still
-        aligned = _align_level(renderer, state, camera, photo, config, prior, still, fresh=number == 0)
+        aligned = _align_level(
+            renderer, state, camera, photo, config, prior, still, fresh=number == 0
+        )
         if aligned is None:
             return None
         state = aligned
@@ -239,7 +243,9 @@ def _align_level(
         there, shot = view
         normal = normal_equations(photo, shot, there.K, *light, scale)
         pixels = int((photo.mask & shot.mask).sum())
-        return with_prior(normal, pixels, float(np.log(there.K[0, 0] / camera.K[0, 0])), prior, config)
+        return with_prior(
+            normal, pixels, float(np.log(there.K[0, 0] / camera.K[0, 0])), prior, config
+        )
 
     pose = state.viewmat
     zoom = state.zoom
@@ -296,7 +302,9 @@ def _align_level(
     )
 
 
-def with_prior(normal: Normal, pixels: int, zoom: float, sigma: float, config: RegisterConfig) -> Normal:
+def with_prior(
+    normal: Normal, pixels: int, zoom: float, sigma: float, config: RegisterConfig
+) -> Normal:
     """Add the prior of the logarithm of the focal length, `zoom` ~ N(0, `sigma`²), to equations and cost."""
     weight = normal.scale**2 * config.correlated / sigma**2
     matrix = normal.matrix.copy()

@@ -135,7 +135,9 @@ class Candidate:
     solved: Solved | None = None
 
 
-def loaded(cameras: Cameras, index: int, config: RegisterConfig, background: Sequence[float]) -> Photo:
+def loaded(
+    cameras: Cameras, index: int, config: RegisterConfig, background: Sequence[float]
+) -> Photo:
     """Read a photo, composited over the background and grey outside of its mask, and shrink it to each size.
 
     Raises:
@@ -150,10 +152,14 @@ def loaded(cameras: Cameras, index: int, config: RegisterConfig, background: Seq
     levels = [_shrink(one, planes, sizes[-1])]
     for side in reversed(sizes[:-1]):  # each level from the previous one, which is fastest
         levels.insert(0, _shrink(one, levels[0][1], side))
-    pyramid = [(camera, level_of(_take_grey(planes), planes[..., 1] > 0.999)) for camera, planes in levels]
+    pyramid = [
+        (camera, level_of(_take_grey(planes), planes[..., 1] > 0.999)) for camera, planes in levels
+    ]
     finest = levels[-1][1]
     camera, small = _shrink(one, finest, config.pool_size)
-    return Photo(one[0], image, everywhere, pyramid, (camera, _take_grey(small)), _take_grey(finest))
+    return Photo(
+        one[0], image, everywhere, pyramid, (camera, _take_grey(small)), _take_grey(finest)
+    )
 
 
 def _shrink(one: Cameras, planes: Float32, side: int) -> tuple[Camera, Float32]:
@@ -183,7 +189,9 @@ class Search:
         self.config = config
         self.match = match
         self.renders = 0
-        self._sift = match if isinstance(match, Sift) else sift_or_none(config.ratio, config.features)
+        self._sift = (
+            match if isinstance(match, Sift) else sift_or_none(config.ratio, config.features)
+        )
 
     def by_alignment(self, start: Start, photo: Photo) -> Candidate | None:
         """Align directly, coarse to fine; return None if the start does not see the scene."""
@@ -205,7 +213,14 @@ class Search:
         if self.match is None:
             return None
         solved = solve(
-            self.renderer, pose, photo.camera, photo.image, photo.mask, self.match, self.config, passes
+            self.renderer,
+            pose,
+            photo.camera,
+            photo.image,
+            photo.mask,
+            self.match,
+            self.config,
+            passes,
         )
         self.renders += passes if solved is None else solved.passes
         if solved is not None and solved.inliers >= self.config.min_inliers:
@@ -224,7 +239,9 @@ class Search:
                 break
         return best, alike
 
-    def _best_of_repeats(self, best: Candidate, photo: Photo) -> tuple[Candidate, list[Float], bool]:
+    def _best_of_repeats(
+        self, best: Candidate, photo: Photo
+    ) -> tuple[Candidate, list[Float], bool]:
         config = self.config
         if self._sift is None:
             return best, [], False
@@ -250,7 +267,10 @@ class Search:
         if len(aligned) < 2:
             return best, [], False
         image = softened(resize(photo.image, (camera.width, camera.height)))
-        looks = [look(self.renderer, zoomed(camera, c.found.zoom, c.found.viewmat), config) for c in aligned]
+        looks = [
+            look(self.renderer, zoomed(camera, c.found.zoom, c.found.viewmat), config)
+            for c in aligned
+        ]
         self.renders += len(looks)
 
         def compared(a: int, b: int) -> float:
@@ -261,7 +281,9 @@ class Search:
             if compared(first, other) < 0:
                 first = other
         alike = [
-            c.found.viewmat for k, c in enumerate(aligned) if k != first and not decisive(compared(first, k))
+            c.found.viewmat
+            for k, c in enumerate(aligned)
+            if k != first and not decisive(compared(first, k))
         ]
         if first == 0:
             return best, alike, False
@@ -280,11 +302,20 @@ class Search:
         """
         refine = self.config.refine
         focal_sigma = solved.focal_sigma
-        near = self._aligned(solved.viewmat, photo.pyramid[-_REFINING_LEVELS:], solved.zoom, focal_sigma)
+        near = self._aligned(
+            solved.viewmat, photo.pyramid[-_REFINING_LEVELS:], solved.zoom, focal_sigma
+        )
         prior = np.zeros((7, 7))
         prior[6, 6] = focal_sigma**-2
         plain = Aligned(
-            solved.viewmat, 1.0, 0.0, inverse(solved.information + prior), 0.0, 0, solved.depth, solved.zoom
+            solved.viewmat,
+            1.0,
+            0.0,
+            inverse(solved.information + prior),
+            0.0,
+            0,
+            solved.depth,
+            solved.zoom,
         )
         if near is None:
             return Candidate(start, plain, self._likeness(plain, photo), solved)
@@ -301,7 +332,10 @@ class Search:
             of_light = inverse(near.covariance)
             both = None if of_light is None else inverse(solved.information + of_light)
             if of_light is not None and both is not None:
-                xi = [*motion_between(solved.viewmat, near.viewmat), np.log(near.zoom / solved.zoom)]
+                xi = [
+                    *motion_between(solved.viewmat, near.viewmat),
+                    np.log(near.zoom / solved.zoom),
+                ]
                 step = both @ (of_light @ xi + np.log(solved.zoom) * prior[6])
                 refined = replace(
                     refined,

@@ -21,7 +21,15 @@ ROUGH_FOCAL_SIGMA = 0.015
 TAIL = 2.0
 """Factor on `focal_sigma` in covariances, because a minority of focal lengths is far off."""
 
-_FEATURE_FIELDS = ("passes", "features", "ratio", "max_reprojection", "min_inliers", "alike", "refine")
+_FEATURE_FIELDS = (
+    "passes",
+    "features",
+    "ratio",
+    "max_reprojection",
+    "min_inliers",
+    "alike",
+    "refine",
+)
 
 
 @dataclass(frozen=True)

@@ -51,10 +51,14 @@ def matcher_named(name: str, ratio: float, most: int) -> Matcher | None:
     if name == "direct" or (name == "auto" and absent):
         return None
     if name not in ("auto", "sift") and not all(name.partition(":")):
-        raise InputError(f"expected auto, sift, direct or MODULE:FUNCTION, got {name!r}", parameter="matcher")
+        raise InputError(
+            f"expected auto, sift, direct or MODULE:FUNCTION, got {name!r}", parameter="matcher"
+        )
     if absent:
         raise MissingDependencyError(
-            f"poses from matches need pycolmap ({absent})", parameter="matcher", hint="pip install pycolmap"
+            f"poses from matches need pycolmap ({absent})",
+            parameter="matcher",
+            hint="pip install pycolmap",
         )
     return Sift(ratio, most) if name in ("auto", "sift") else _load_plugin(name)
 
@@ -63,7 +67,9 @@ def _explain_unusable() -> str:
     """Return why pycolmap is unavailable, or ""."""
     if sys.modules.get("pycolmap", ...) is None or find_spec("pycolmap") is None:
         where = (sys.platform, platform.machine())
-        no_wheel = "" if where in _PYCOLMAP_PLATFORMS else f", and has no wheel for {' '.join(where)}"
+        no_wheel = (
+            "" if where in _PYCOLMAP_PLATFORMS else f", and has no wheel for {' '.join(where)}"
+        )
         return f"pycolmap is not installed{no_wheel}"
     try:
         importlib.import_module("pycolmap")
@@ -128,7 +134,9 @@ def checked_pairs(what: str, pairs: Any, *shapes: tuple[int, ...]) -> Pairs:
         within &= ((points >= 0) & (points <= [width, height])).all(1)
     if len(a) and not within.any():
         sizes = " and ".join(f"{width}×{height}" for height, width, *_ in shapes)
-        raise InputError(f"{expected}, got {len(a)} pairs, none of them within the images ({sizes})")
+        raise InputError(
+            f"{expected}, got {len(a)} pairs, none of them within the images ({sizes})"
+        )
     return a[within], b[within]
 
 

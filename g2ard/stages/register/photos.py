@@ -31,7 +31,14 @@ from g2ard.stages.register.config import TAIL, RegisterConfig
 from g2ard.stages.register.grey import band_passed
 from g2ard.stages.register.matchers import matcher_named
 from g2ard.stages.register.pose import motion_between, pose_error
-from g2ard.stages.register.report import KEPT, PhotoReport, PoseError, Registered, RegisterReport, Status
+from g2ard.stages.register.report import (
+    KEPT,
+    PhotoReport,
+    PoseError,
+    Registered,
+    RegisterReport,
+    Status,
+)
 
 _FEATURES_BONUS = 0.05
 """Bonus in likeness for a pose confirmed by features: they detect errors of decimetres, ZNCC of metres."""
@@ -68,7 +75,9 @@ def register(
     require("keep", repr(keep), keep in KEPT, ", ".join(KEPT))
     given = _check_poses(starts, photos)
     if not given and pool is None:
-        raise InputError("no photo has a starting pose; pass starting poses or a pool", parameter="starts")
+        raise InputError(
+            "no photo has a starting pose; pass starting poses or a pool", parameter="starts"
+        )
     renderer = Renderer(scene, background=background)
     renders = None if pool is None else PoolRenders(renderer, pool, config, progress)
     search = Search(renderer, config, matcher_named(config.matcher, config.ratio, config.features))
@@ -201,7 +210,12 @@ def _try_features(search: Search, aligned: list[Candidate], photo: Photo) -> lis
 
 
 def _report(
-    name: str, best: Candidate, config: RegisterConfig, renders: int, focal: float, alike: list[Float]
+    name: str,
+    best: Candidate,
+    config: RegisterConfig,
+    renders: int,
+    focal: float,
+    alike: list[Float],
 ) -> PhotoReport:
     estimate = best.found
     sigma = None
@@ -209,9 +223,9 @@ def _report(
     prior = best.solved.focal_sigma if best.solved else config.focal_sigma
     if estimate.covariance is not None:
         motions = [motion_between(estimate.viewmat, other) for other in alike]
-        covariance = _add_tail(estimate.covariance, prior)[:6, :6] + sum(np.outer(m, m) for m in motions) / (
-            1 + len(motions)
-        )
+        covariance = _add_tail(estimate.covariance, prior)[:6, :6] + sum(
+            np.outer(m, m) for m in motions
+        ) / (1 + len(motions))
         position = np.sqrt(np.trace(covariance[:3, :3]))
         rotation = np.sqrt(np.trace(covariance[3:6, 3:6]))
         sigma = PoseError(float(position), float(np.degrees(rotation)))
@@ -235,7 +249,9 @@ def _report(
         overlap=estimate.overlap,
         covariance=None if covariance is None else _list_rows(covariance),
         focal=float(focal * estimate.zoom),
-        focal_sigma=None if estimate.covariance is None else float(estimate.covariance[6, 6]) ** 0.5,
+        focal_sigma=None
+        if estimate.covariance is None
+        else float(estimate.covariance[6, 6]) ** 0.5,
         sigma=sigma,
         renders=renders,
         camera_from_world=_list_rows(estimate.viewmat),
@@ -263,5 +279,8 @@ def _judge(
     if sigma.rotation > config.max_angle_sigma:
         return "uncertain", f"the rotation is only known to {sigma.rotation:.2g}°"
     if sigma.position > config.max_position_sigma * depth:
-        return "uncertain", f"the position is only known to {sigma.position / depth:.2g} of the depth"
+        return (
+            "uncertain",
+            f"the position is only known to {sigma.position / depth:.2g} of the depth",
+        )
     return "registered", None

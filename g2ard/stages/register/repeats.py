@@ -95,7 +95,9 @@ def softened(image: Float32) -> Float:
     return np.stack([blurred(image[..., c].astype(np.float64)) for c in range(3)], 2)
 
 
-def repeated_poses(renderer: Renderer, camera: Camera, sift: Sift, config: RegisterConfig) -> list[Float]:
+def repeated_poses(
+    renderer: Renderer, camera: Camera, sift: Sift, config: RegisterConfig
+) -> list[Float]:
     """Return at most `_MOST_REPEATS` poses whose renders look like the one of `camera`, most alike first."""
     out = renderer.render(camera, median=True)
     places, descriptors = sift.features(np.clip(out.image, 0, 1))

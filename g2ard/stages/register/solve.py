@@ -161,7 +161,9 @@ def lifted(out: Rendered, camera: Camera, uv: Float, config: RegisterConfig) -> 
     return np.einsum("mi,ij->mj", seen - T[:3, 3], T[:3, :3], optimize=False), known
 
 
-def solve_pnp(camera: Camera, uv: Float, points: Float, config: RegisterConfig) -> tuple[Float, Mask] | None:
+def solve_pnp(
+    camera: Camera, uv: Float, points: Float, config: RegisterConfig
+) -> tuple[Float, Mask] | None:
     """Solve PnP for (M, 2) pixels of (M, 3) points; return pose and inlier mask, or None with too few."""
     import pycolmap
 
@@ -169,7 +171,10 @@ def solve_pnp(camera: Camera, uv: Float, points: Float, config: RegisterConfig) 
         return None
     K = camera.K
     lens = pycolmap.Camera(
-        model="PINHOLE", width=camera.width, height=camera.height, params=[K[0, 0], K[1, 1], K[0, 2], K[1, 2]]
+        model="PINHOLE",
+        width=camera.width,
+        height=camera.height,
+        params=[K[0, 0], K[1, 1], K[0, 2], K[1, 2]],
     )
     options = pycolmap.AbsolutePoseEstimationOptions()
     options.ransac.max_error = config.max_reprojection
@@ -178,7 +183,9 @@ def solve_pnp(camera: Camera, uv: Float, points: Float, config: RegisterConfig) 
     refinement = pycolmap.AbsolutePoseRefinementOptions()
     refinement.gradient_tolerance = 1e-8
     middle = np.median(points, 0)
-    answer = pycolmap.estimate_and_refine_absolute_pose(uv, points - middle, lens, options, refinement)
+    answer = pycolmap.estimate_and_refine_absolute_pose(
+        uv, points - middle, lens, options, refinement
+    )
     if answer is None or int(answer["num_inliers"]) < _LEAST_MATCHES:
         return None
     T = np.eye(4)

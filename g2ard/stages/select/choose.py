@@ -106,7 +106,8 @@ def select(
         rows = np.flatnonzero(usable)
         order, gains, evaluations = greedy(splats, cameras.take(rows), options, progress, seconds)
         order = rows[order]
-        refused = ~np.isin(np.arange(len(cameras)), order)  # also views that see no cell, which greedy drops
+        # also views that see no cell, which greedy drops
+        refused = ~np.isin(np.arange(len(cameras)), order)
     else:
         of_usable = np.where(usable, candidates.weights, 0.0)
         order = poses.facility_location(alike, of_usable, usable, candidates.shares)

@@ -92,7 +92,12 @@ def _measure_light(
         batch = range(first, min(first + _BATCH, len(cameras)))
         views = [view_of(here, i, settings) for i in batch]
         for i, sums in zip(batch, _core.accumulate_each(arrays, views, settings), strict=True):
-            pixels = float(cameras.widths[i] * cameras.heights[i]) / float(here.widths[i] * here.heights[i])
-            light[i] = np.minimum(sums["weight"][rows] * (pixels * share), _MOST_PIXELS) / _RESOLVING_PIXELS
+            pixels = float(cameras.widths[i] * cameras.heights[i]) / float(
+                here.widths[i] * here.heights[i]
+            )
+            light[i] = (
+                np.minimum(sums["weight"][rows] * (pixels * share), _MOST_PIXELS)
+                / _RESOLVING_PIXELS
+            )
         tell(batch.stop)
     return light

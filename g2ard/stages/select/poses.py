@@ -123,7 +123,8 @@ def pose_kernel(cameras: Cameras, depths: Float) -> Float:
     rotation."""
     seen = depths[depths > 0]
     scale = np.where(depths > 0, depths, np.median(seen) if len(seen) else 1.0)
-    positions = cameras.positions - np.median(cameras.positions, axis=0)  # robust to a single far pose
+    # robust to a single far pose
+    positions = cameras.positions - np.median(cameras.positions, axis=0)
     with np.errstate(over="ignore", invalid="ignore"):  # squares of 1e300 overflow to infinity
         away = np.nan_to_num(_measure_squares(positions), nan=np.inf) / (scale[:, None] * scale)
     return np.exp(-(away + _measure_squares(cameras.forwards)) / _KERNEL_BANDWIDTH**2)
@@ -158,7 +159,8 @@ def facility_location(alike: Float, pose_weights: Float, usable: Mask, shares: F
     """
     away = bandwidths_apart(alike)
     worth = shares**_SCENE_SHARE_EXPONENT
-    best = np.zeros(len(alike))  # likeness of each candidate to the chosen view that is most like it
+    # likeness of each candidate to the chosen view that is most like it
+    best = np.zeros(len(alike))
     left = usable.copy()
     nearest = np.where(usable, np.inf, -np.inf)  # distance to the nearest chosen view
     order: list[int] = []

@@ -64,7 +64,11 @@ class SimplifyConfig(Settings, tag="method"):
         30.0
         """
         own = {"retention": _RETENTION[self.method], **_CORE[self.method]}
-        given = {f.name: own[f.name] for f in fields(self) if f.name in own and getattr(self, f.name) is None}
+        given = {
+            f.name: own[f.name]
+            for f in fields(self)
+            if f.name in own and getattr(self, f.name) is None
+        }
         if isinstance(self, Default) and "morton_premerge_ratio" in given:
             given["morton_premerge_ratio"] *= max(1.0, math.sqrt(ratio / _USUAL_RATIO))
         if antialiased and isinstance(self, Pairs):

@@ -45,7 +45,9 @@ def rows_of(visibility: SampledVisibility, count: int, finite: Mask | slice) -> 
         shape = getattr(visibility, name).shape
         if shape != (count,):
             raise InputError(f"visibility.{name}: expected shape ({count},), got {shape}")
-    weight, pixel = (np.asarray(a, np.float32)[finite] for a in (visibility.weight, visibility.pixel_size))
+    weight, pixel = (
+        np.asarray(a, np.float32)[finite] for a in (visibility.weight, visibility.pixel_size)
+    )
     return SampledVisibility(np.ascontiguousarray(weight), np.ascontiguousarray(pixel))
 
 
@@ -121,7 +123,9 @@ def merge_and_fit(
     }
 
 
-def fit_opacities(scene: Splats, members: Values, wanted: Values, now: Values, mean: float) -> Splats:
+def fit_opacities(
+    scene: Splats, members: Values, wanted: Values, now: Values, mean: float
+) -> Splats:
     """Fit opacities so that views see about as much of each row as of its members.
 
     α is multiplied by ratio^¼, with the ratio limited to 0.5–2, because neighbours share a deficit and other
@@ -153,7 +157,9 @@ def fit_opacities(scene: Splats, members: Values, wanted: Values, now: Values, m
     return replace(
         scene,
         logit_opacities=np.where(changed, logits, scene.logit_opacities).astype(np.float32),
-        scales=np.where(grown, scene.scales * np.sqrt(growth)[:, None], scene.scales).astype(np.float32),
+        scales=np.where(grown, scene.scales * np.sqrt(growth)[:, None], scene.scales).astype(
+            np.float32
+        ),
     )
 
 

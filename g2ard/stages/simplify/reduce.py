@@ -210,7 +210,9 @@ def simplify(
     return _finish(splats, finite, out, lost)
 
 
-def _finish(splats: Splats, finite: Mask | slice, out: dict[str, Any], lost: float | None) -> Simplified:
+def _finish(
+    splats: Splats, finite: Mask | slice, out: dict[str, Any], lost: float | None
+) -> Simplified:
     parents = np.full(len(splats), -1, np.int64)
     parents[finite] = out["parents"]
     small = splats_of(splats, out).with_sh_degree(splats.sh_degree)
@@ -224,7 +226,9 @@ def _finish(splats: Splats, finite: Mask | slice, out: dict[str, Any], lost: flo
         merged_members=kept - alone,
         rounds=tuple(SimplifyRound.of(r) for r in out["rounds"]),
         protected=int(np.count_nonzero(protected)),
-        nonfinite_rows=0 if isinstance(finite, slice) else len(splats) - int(np.count_nonzero(finite)),
+        nonfinite_rows=0
+        if isinstance(finite, slice)
+        else len(splats) - int(np.count_nonzero(finite)),
         infinite_logits=out["infinite_logits"],
         clamped_opacities=out["clamped_opacities"],
         fitted=out.get("fitted", 0),
