@@ -183,6 +183,7 @@ class FusedEngine:
         return self._trainer.state(part)[part]
 
     def load(self, state: dict[str, Values]) -> None:
+        """Restore a `state`, taking the trainer's arrays out of it to free their memory."""
         self._skipped_before = int(state["skipped"]) - self._trainer.skipped
         self._trainer.load(state)
         self._anchor()

@@ -265,15 +265,15 @@ impl PyTrainer {
         Ok(dict)
     }
 
-    /// Restore a `state`; anchors must be set again.
+    /// Restore a `state`, whose arrays leave the dict one by one to free their memory; anchors must be set again.
     fn load(&self, py: Python<'_>, state: &Bound<'_, PyDict>) -> PyResult<()> {
         let state = Exported {
-            values: vector(state, "values")?,
-            first: vector(state, "first")?,
-            second: vector(state, "second")?,
-            units: vector(state, "units")?,
-            steps: vector(state, "steps")?,
-            order: vector(state, "order")?,
+            values: take(state, "values")?,
+            first: take(state, "first")?,
+            second: take(state, "second")?,
+            units: take(state, "units")?,
+            steps: take(state, "steps")?,
+            order: take(state, "order")?,
         };
         let mut trained = work::locked(py, &self.trained);
         noted(trained.inner.import(&state)).map_err(to_py)
@@ -286,14 +286,17 @@ impl PyTrainer {
     }
 }
 
-fn vector<T: numpy::Element + Clone>(
+/// Take an array out of a dict.
+fn take<T: numpy::Element + Clone>(
     state: &Bound<'_, PyDict>,
     name: &'static str,
 ) -> PyResult<Vec<T>> {
     let missing = || invalid(name, "an array in the state", "none");
     let value = state.get_item(name)?.ok_or_else(missing)?;
     let array: PyReadonlyArray1<'_, T> = value.extract()?;
-    Ok(array.as_array().to_vec())
+    let values = array.as_array().to_vec();
+    state.del_item(name)?;
+    Ok(values)
 }
 
 /// One attribute of `adam_rows`: values, first and second moments, gradients, rate, and factors of the rate.
