@@ -26,7 +26,7 @@ from g2ard.io.scene_formats import axes_note, scene_format
 from g2ard.io.scenes import tell, write_scene
 from g2ard.pipeline.presets import configure
 from g2ard.progress import Detail
-from g2ard.system import devices
+from g2ard.system import devices, spill
 
 if TYPE_CHECKING:
     from g2ard.io.stream import SceneStream
@@ -174,7 +174,9 @@ class Run(Claims):
         self.progress(stage, 0, 0)
 
     def tell_notes(self) -> None:
-        """Report GPU fallbacks since the last call, and warn once if the adapter is a software renderer."""
+        """Report full disks and GPU fallbacks since the last call, and warn once of a software renderer."""
+        for note in spill.notes():
+            self.console.say(note)
         if self.device in ("auto", "gpu"):
             for note in devices.notes():
                 self.noted = True

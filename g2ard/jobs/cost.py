@@ -74,7 +74,7 @@ class Cost:
         pixels: mean of the training views.
         steps: of all recoveries; None if a time limits them.
         bytes: peak memory.
-        disk: bytes of files of a scene in tiles, until the result is written.
+        disk: bytes of temporary files: of a scene in tiles, or of images beyond what memory holds.
     """
 
     views: int
@@ -98,9 +98,8 @@ def cost_of(job: DistillJob, count: int, *, page: bool = True) -> Cost:
     steps: int | None = 0
     if trains:
         steps = None if job.config.recover.recovery_time is not None else job.steps(count)
-    disk = 0 if job.plan is None else job.plan.disk
-    disk += _IMAGE_FILE_BYTES * pixels * views if disk and job.renders else 0
-    return Cost(views, pixels, steps, _peak_bytes(job, count, page, trains=trains), disk)
+    memory = _peak_bytes(job, count, page, trains=trains)
+    return Cost(views, pixels, steps, memory, _disk_bytes(job, pixels * views, trains=trains))
 
 
 def cost_of_recovery(
@@ -116,7 +115,8 @@ def cost_of_recovery(
     dense = 0 if teacher is None else int(_KEPT_TIMES * teacher.nbytes)
     memory = _PROGRAM_BYTES + _target_bytes(views, teacher, CACHE_BYTES) + _image_bytes(views)
     memory += dense + trainer_bytes(len(scene), scene.sh_degree)
-    return Cost(sum(map(len, views)), _mean_pixels(views[0]), steps, memory)
+    disk = _spilled_bytes(views, teacher, CACHE_BYTES)
+    return Cost(sum(map(len, views)), _mean_pixels(views[0]), steps, memory, disk)
 
 
 def _mean_pixels(cameras: Cameras) -> int:
@@ -148,22 +148,13 @@ def cost_of_cleaning(scene: SceneStream, kinds: Sequence[str]) -> Cost:
 
 def _peak_bytes(job: DistillJob, count: int, page: bool, *, trains: bool) -> int:
     """Return the peak memory: of simplification, of recovery, or of what is written at the end."""
-    views = job.views
-    train = job.views.train.cameras
     count = plan_round_counts(job.dense, count, job.config)[0]
     degree = job.sh_degree
     dense = len(job.prior)
     scene = job.prior.nbytes
     small = 4 * row_width(degree) * count
     rows = 0 if job.plan else dense  # that view.html may show
-    chosen = job.config.select.count_of(len(train))
-    used = (
-        [train if chosen == "auto" else train.take(range(min(chosen, len(train))))]
-        if trains
-        else []
-    )
-    used += [*views.untrained, *filter(None, [views.twice])]
-    used += [] if views.full is None else [limit_pixels(views.full)]
+    used = _target_views(job, trains=trains)
     targets = _target_bytes(used, job.prior if job.renders else None, job.teaching.limit)
     kept = _PROGRAM_BYTES + _sampled(_SURVEY, dense) + targets + _image_bytes(used) + 2 * small
     packing = _packing_bytes(count, degree)
@@ -174,10 +165,45 @@ def _peak_bytes(job: DistillJob, count: int, page: bool, *, trains: bool) -> int
     return held if job.plan is None else max(held, job.plan.bytes)
 
 
+def _target_views(job: DistillJob, *, trains: bool) -> list[Cameras]:
+    """Return the parts of a job's views that have targets of their own."""
+    views = job.views
+    parts: list[Cameras] = []
+    if trains:
+        train = views.train.cameras
+        chosen = job.config.select.count_of(len(train))
+        parts.append(train if chosen == "auto" else train.take(range(min(chosen, len(train)))))
+    parts += views.untrained
+    if views.twice is not None:
+        parts.append(views.twice)
+    if views.full is not None:
+        parts.append(limit_pixels(views.full))
+    return parts
+
+
+def _disk_bytes(job: DistillJob, pixels: int, *, trains: bool) -> int:
+    """Return the bytes of temporary files: of tiles and renders in tiles, or of images beyond what memory holds."""
+    if job.plan is not None and job.renders:
+        return job.plan.disk + _IMAGE_FILE_BYTES * pixels
+    teacher = job.prior if job.renders else None
+    spilled = _spilled_bytes(_target_views(job, trains=trains), teacher, job.teaching.limit)
+    return spilled if job.plan is None else job.plan.disk + spilled
+
+
 def _target_bytes(views: Sequence[Cameras], teacher: Splats | None, limit: int) -> int:
-    """Return the bytes of targets in memory, at most `limit` per part: renders in 16 bits, or photos in 8."""
+    """Return the bytes of targets in memory, at most `limit` per part."""
+    return sum(min(limit, size) for size in _image_sizes(views, teacher))
+
+
+def _spilled_bytes(views: Sequence[Cameras], teacher: Splats | None, limit: int) -> int:
+    """Return the bytes of targets that memory does not hold, see `Spill`."""
+    return sum(max(0, size - limit) for size in _image_sizes(views, teacher))
+
+
+def _image_sizes(views: Sequence[Cameras], teacher: Splats | None) -> list[int]:
+    """Return the bytes of each part's targets: renders in 16 bits, or photos in 8."""
     pixel = 3 if teacher is None else 6
-    return sum(min(limit, pixel * int(part.pixels.sum())) for part in views)
+    return [pixel * int(part.pixels.sum()) for part in views]
 
 
 def _sampled(cost: tuple[int, int], count: int) -> int:

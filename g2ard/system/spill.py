@@ -17,6 +17,15 @@ from g2ard.arrays import Values
 
 _FREE_BYTES = 1_000_000_000
 """Bytes of the disk left free for other files."""
+_NOTES: list[str] = []
+"""Pending messages, see `notes`."""
+
+
+def notes() -> list[str]:
+    """Return and clear pending messages, such as that a disk is full."""
+    pending = list(_NOTES)
+    _NOTES.clear()
+    return pending
 
 
 class Spill:
@@ -24,7 +33,7 @@ class Spill:
 
     The environment variable `TMPDIR` chooses its folder. The default is `/var/tmp` where that exists, because
     `/tmp` may be in memory. A full disk or a missing folder is no error: from then on nothing is added. A
-    copy, such as one for another process, begins empty.
+    copy, such as one for another process, begins empty. `notes` tells about a full disk.
 
     >>> spill = Spill()
     >>> spill.add("a", np.arange(3))
@@ -53,6 +62,7 @@ class Spill:
                 start = self._append(array)
             except OSError:
                 self.full = True
+                _note_lack(_choose_folder())
             else:
                 self._places[key] = array.dtype, start, array.shape
 
@@ -76,6 +86,13 @@ class Spill:
         # Mapped anew by each call: no thread moves another's position, and the memory is free afterwards.
         mapped: Values = np.memmap(self._file, dtype, "c", start, shape)  # type: ignore[call-overload]
         return mapped.view(np.ndarray)
+
+
+def _note_lack(folder: str) -> None:
+    lack = f"{folder} has no room for all images; the others are made again at each use"
+    note = f"warning: {lack} (TMPDIR chooses another folder)"
+    if note not in _NOTES:
+        _NOTES.append(note)
 
 
 def _choose_folder() -> str:

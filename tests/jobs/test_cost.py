@@ -167,6 +167,8 @@ def test_memory_limits_targets(pictured: bool, tmp_path: Path) -> None:
     bytes_of = 400 * 300 * (3 if pictured else 6)
     spared = cost_of(free, 90).bytes - cost_of(limited, 90).bytes
     assert spared > 20 * bytes_of - 2_000_000  # views of other kinds spare more
+    assert cost_of(free, 90).disk == 0
+    assert cost_of(limited, 90).disk == spared
     for job, most in ((free, 2_000_000_000), (limited, 2_000_000)):
         train = job.targets.train
         fill(train, silent)

@@ -29,6 +29,7 @@ from g2ard.rendering.targets import (
     mask_of,
 )
 from g2ard.scene.cameras import Cameras
+from g2ard.system import spill
 from helpers.scenes import around, checkered_ball
 from helpers.view_files import photo
 
@@ -103,10 +104,14 @@ def test_targets_are_made_again_if_the_disk_is_full(
     monkeypatch.setattr(
         Renderer, "clipped", lambda self, view: rendered.append(view) or real(self, view)
     )
+    spill.notes()
     targets = TeacherRenders(ball, views, limit=5 * IMAGE_BYTES + 99)
     rendered.clear()
     fill(targets, silent)
     assert not rendered
+    (note,) = spill.notes()
+    assert "TMPDIR" in note
+    assert spill.notes() == []
     for _ in range(2):
         for view in range(12):
             np.testing.assert_array_equal(targets[view], want[view])
