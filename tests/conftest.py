@@ -178,6 +178,9 @@ _UNSCORED = {
     "levels",
     "report",
     "viewer",
+    "io/test_upright",
+    "jobs/test_sizes",
+    "tests/test_api",
     "tests/test_documented_commands",
     "tiles/test_distill",
 }

@@ -41,6 +41,8 @@ _MOST = 100
 """Plans that are kept in memory."""
 SIZE = (440, 330)
 """Size of generated views in tests that draw hundreds: a third of the usual pixels; `clean` draws at 400."""
+_USUAL_SIZE = (800, 600)
+"""Size of generated views that a run plans unless another one is requested."""
 _CELLS = (200_000, 6_000_000)
 """Cells of occupancy grids: of small scenes, the usual two million are most of the time of planning."""
 _FULL_PIXELS = 4 * SIZE[0] * SIZE[1]
@@ -49,19 +51,22 @@ _FULL_PIXELS = 4 * SIZE[0] * SIZE[1]
 _plans: OrderedDict[str, Any] = OrderedDict()
 
 
-def share_plans(monkeypatch: pytest.MonkeyPatch, **options: Any) -> None:
-    """Plan a scene's views once for all processes; tests/poses tests that plans are the same each time."""
+def share_plans(monkeypatch: pytest.MonkeyPatch, usual: tuple[int, int] = _USUAL_SIZE) -> None:
+    """Plan a scene's views once for all processes, those of the usual size as large as `usual`.
+
+    tests/poses tests that plans are the same each time.
+    """
     for name in (*_IMPORTERS, *_SHOWING):  # first all, or one would import another's patch for good
         import_module(name)
     for name in _IMPORTERS:
-        monkeypatch.setattr(f"{name}.plan_pool", partial(_shared, **options))
+        monkeypatch.setattr(f"{name}.plan_pool", partial(_shared, usual=usual))
     for name in _SHOWING:
         monkeypatch.setattr(f"{name}.best_views", _shown)
 
 
 def plan_small_scenes(monkeypatch: pytest.MonkeyPatch, *, coarse: bool = True) -> None:
     """Share plans of smaller views, `coarse` ones in coarser grids, and score few views at full size."""
-    share_plans(monkeypatch, size=SIZE)
+    share_plans(monkeypatch, SIZE)
     monkeypatch.setattr("g2ard.jobs.run_views.FULL_PIXELS", _FULL_PIXELS)
     if coarse:
         monkeypatch.setattr("g2ard.poses.matter._CELLS", _CELLS)
@@ -79,7 +84,15 @@ def _shown(
     return _kept(key, lambda: best_views(splats, count, **options))
 
 
-def _shared(splats: Splats, *count: int, progress: Progress = silent, **options: Any) -> Pool:
+def _shared(
+    splats: Splats,
+    *count: int,
+    usual: tuple[int, int],
+    size: tuple[int, int] = _USUAL_SIZE,
+    progress: Progress = silent,
+    **options: Any,
+) -> Pool:
+    options["size"] = usual if size == _USUAL_SIZE else size
     key = f"{splats.fingerprint()} {splats.up} {count} {matter._CELLS} {sorted(options.items())}"
     plan = cache(lambda: plan_pool(splats, *count, progress=progress, **options))
 

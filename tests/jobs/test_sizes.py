@@ -61,6 +61,15 @@ def test_every_command_with_a_size_is_tried() -> None:
     assert sized - set(OTHER) == set(COMMANDS)
 
 
+def test_generated_views_are_as_small_as_tests_plan_them(
+    inputs: Path, tmp_path: Path, command_line: CommandLine
+) -> None:
+    """The usual size would double the time of all tests that draw generated views."""
+    folder = shutil.copytree(inputs, tmp_path / "there")
+    ask = (*COMMANDS["evaluate"].split(), "--views", "made")
+    assert f" {GENERATED}×{SIZE[1]} px" in "".join(succeeds(command_line, folder, *ask))
+
+
 CASES = [
     (command, views) for command in COMMANDS for views in ("made", "views.json", "photos.json")
 ]
