@@ -182,18 +182,14 @@ def test_memory_limits_targets(pictured: bool, tmp_path: Path) -> None:
 _DISTIL = "--steps 4 --size 200"
 _GIVEN = "--views views.json --focus far"
 MEASURED = {
-    "distil SH 0": f"distill 60000_0.ply -r 10 {_DISTIL} {_GIVEN}",
-    "distil SH 1": f"distill 20000_1.ply -r 4 {_DISTIL} {_GIVEN}",
     "distil SH 3": f"distill 20000_3.ply -r 10 {_DISTIL}",
-    "distil without a page": f"distill 60000_3.ply -r 10 {_DISTIL} {_GIVEN} --no-page",
     "distil larger views": "distill 20000_0.ply -r 4 --steps 4 --size 500 --focus far --no-page",
-    "distil with few steps of the paper": f"distill 20000_1.ply -r 10 {_DISTIL} {_GIVEN} --preset paper",
+    "distil with few steps of the paper": f"distill 60000_2.ply -r 10 {_DISTIL} {_GIVEN} --preset paper --no-page",
     "distil photos": "distill --views photos -n 500 --steps 12",
     "simplify": "simplify 60000_3.ply -r 10",
     "simplify without views": "simplify 60000_2.ply -r 10 --no-views",
     "clean nothing": "clean 60000_3.ply --only none",
     "recover": "recover 20000_2.ply --teacher 60000_3.ply --views views.json --steps 4",
-    "adapt": "adapt 20000_0.ply --teacher 60000_0.ply --views views.json --steps 4",
 }
 """Name → arguments; scenes are called by their count and SH degree."""
 
