@@ -37,7 +37,7 @@ from g2ard.io.photo_headers import (
 from g2ard.io.types import Note, Notes, Size, ViewSet
 from g2ard.progress import plural
 from g2ard.scene.cameras import USUAL, Cameras
-from g2ard.scene.lenses import PhotoLens
+from g2ard.scene.lenses import PhotoLens, pinhole_matrix
 from g2ard.scene.transform import rotation_matrices
 
 
@@ -76,7 +76,7 @@ class Lens(NamedTuple):
         """Return the lens of focal lengths and a principal point, None for the middle of the image."""
         fx, fy = focal
         cx, cy = middle or (size[0] / 2, size[1] / 2)
-        K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], float)
+        K = pinhole_matrix(fx, fy, cx, cy)
         return cls(size, K, distortion)
 
     @classmethod

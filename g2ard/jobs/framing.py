@@ -9,6 +9,7 @@ import numpy as np
 from g2ard.arrays import Float, Mask
 from g2ard.rendering.renderer import Renderer
 from g2ard.scene.cameras import Camera, Cameras
+from g2ard.scene.lenses import pinhole_matrix
 from g2ard.scene.samples import take_evenly
 from g2ard.scene.splats import Splats
 
@@ -135,7 +136,7 @@ def _look_around(
     """
     focal = _SIDE / (2 * reach)
     middle = _SIDE / 2
-    K = np.array([[focal, 0, middle], [0, focal, middle], [0, 0, 1]])
+    K = pinhole_matrix(focal, focal, middle, middle)
     renderer = Renderer(_thin_scene(scene))
     drawn = renderer.render(Camera(view.viewmat, K, _SIDE, _SIDE), median=True)
     assert drawn.median is not None

@@ -28,6 +28,7 @@ from g2ard.pipeline.presets import configure
 from g2ard.poses import plan_pool
 from g2ard.progress import Progress, Say, plural, silent, unsaid
 from g2ard.scene.cameras import Camera, Cameras
+from g2ard.scene.lenses import pinhole_matrix
 from g2ard.scene.splats import Splats
 from g2ard.stages.register import PhotoReport, PoseError, RegisterConfig, Registered, pose_error
 from g2ard.stages.register import register as find_poses
@@ -292,7 +293,7 @@ def _sizes(files: list[Path]) -> list[tuple[int, int]]:
 
 def _centred(focal: float, size: tuple[int, int]) -> Camera:
     size = max(size[0], 1), max(size[1], 1)
-    K = np.array([[focal, 0, size[0] / 2], [0, focal, size[1] / 2], [0, 0, 1]])
+    K = pinhole_matrix(focal, focal, size[0] / 2, size[1] / 2)
     return Camera(np.eye(4), K, *size)
 
 

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from g2ard.arrays import Float, Int, Mask
+from g2ard.arrays import Float, Int, Mask, Values
 from g2ard.config.checks import check_direction, check_fields, check_vector
 from g2ard.errors import InputError, require
 from g2ard.progress import plural
-from g2ard.scene.lenses import PhotoLens
+from g2ard.scene.lenses import PhotoLens, pinhole_matrix
 from g2ard.scene.samples import evenly_spaced
 from g2ard.system.keys import UNKEYED, key_of, keyed
 from g2ard.system.shown import Shown
@@ -122,7 +122,7 @@ class Camera(Shown):
         """
         require("fov", fov, 0 < fov < 180, "degrees between 0 and 180")
         focal = width / 2 / np.tan(np.radians(fov) / 2)
-        K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
+        K = pinhole_matrix(focal, focal, width / 2, height / 2)
         return cls(look_at(position, target, up), K, width, height, name)
 
     @property
@@ -140,8 +140,9 @@ class Camera(Shown):
         x, y, z = self.viewmat[:3, :3] @ away.T
         front = z > 0
         ahead = np.where(front, z, 1.0)
-        u = self.K[0, 0] * x / ahead + self.K[0, 2]
-        v = self.K[1, 1] * y / ahead + self.K[1, 2]
+        (fx, _, cx), (_, fy, cy), _ = self.K
+        u = fx * x / ahead + cx
+        v = fy * y / ahead + cy
         across = np.abs(2 * u / self.width - 1)
         down = np.abs(2 * v / self.height - 1)
         return np.where(front, np.maximum(across, down), np.inf)
@@ -228,22 +229,30 @@ class Cameras(Shown):
     def _faults(self, scales: Float) -> dict[str, Mask]:
         """Return the (C,) mask of each fault, the most basic first; keys are templates of messages."""
         n = len(self)
-        values = np.hstack([self.viewmats.reshape(n, 16), self.Ks.reshape(n, 9), self.distortions])
+        values = np.hstack(
+            [
+                self.viewmats.reshape(n, 16),
+                self.Ks.reshape(n, 9),
+                self.distortions,
+            ]
+        )
         largest = np.abs(values).max(1)
         last_row = np.abs(self.viewmats[:, 3] - (0, 0, 0, 1)).max(1)
         rotations = self.viewmats[:, :3, :3]
         square = rotations @ rotations.transpose(0, 2, 1)  # the unit matrix times s²
         unit = scales**2
         skew = np.abs(square - unit[:, None, None] * np.eye(3)).max((1, 2))
+        skews = skew > 2 * _POSE_SLACK * unit
+        skews |= ~(scales > 0)
         pixels = self.widths.astype(np.float64) * self.heights
         focals = self.Ks[:, [0, 1], [0, 1]]
+        beyond = f"has a pose or intrinsics above {_LARGEST_CAMERA_VALUE:.0e}"
         pose = "has a pose that {}; expected a rotation and a translation".format
         return {
             "has a pose or intrinsics that are not finite": ~np.isfinite(largest),
-            f"has a pose or intrinsics above {_LARGEST_CAMERA_VALUE:.0e}": largest
-            > _LARGEST_CAMERA_VALUE,
+            beyond: largest > _LARGEST_CAMERA_VALUE,
             pose("has another last row than 0 0 0 1"): last_row > _POSE_SLACK,
-            pose("skews"): (skew > 2 * _POSE_SLACK * unit) | ~(scales > 0),
+            pose("skews"): skews,
             pose("scales by {scale:.4g}"): np.abs(scales - 1) > _POSE_SLACK,
             pose("mirrors"): np.linalg.det(rotations) < 0,
             "has an empty image, {width}×{height}": np.minimum(self.widths, self.heights) < 1,
@@ -327,14 +336,20 @@ class Cameras(Shown):
         if not len(self):
             return 0.0
         positions = self.positions
-        away = np.linalg.norm(positions - positions.mean(0), axis=1).max()
+        offsets = positions - positions.mean(0)
+        away = np.linalg.norm(offsets, axis=1).max()
         rounding = 1e-9 * np.abs(positions).max()
-        return 1.1 * float(away) if away > rounding else 0.0
+        if away > rounding:
+            return 1.1 * float(away)
+        return 0.0
 
     def take(self, index: ArrayLike) -> Cameras:
         """Return the views that `index` selects (a mask or indices), in its order."""
         index = np.asarray(index)
-        rows = np.flatnonzero(index) if index.dtype == bool else index.astype(int).reshape(-1)
+        if index.dtype == bool:
+            rows = np.flatnonzero(index)
+        else:
+            rows = index.astype(int).reshape(-1)
         fields: dict[str, Any] = {name: getattr(self, name)[rows] for name in _ARRAY_SHAPES}
         for name in _TUPLE_FIELDS:
             values = getattr(self, name)
@@ -343,7 +358,8 @@ class Cameras(Shown):
 
     def usual(self) -> Cameras:
         """Return the views of the usual kind; all views if there are no others."""
-        return self.take(rows_by_kind(self.kinds).get(USUAL, range(len(self))))
+        rows = rows_by_kind(self.kinds).get(USUAL, range(len(self)))
+        return self.take(rows)
 
     def fingerprint(self) -> str:
         """Return a hash of the views without their photos and masks."""
@@ -377,16 +393,28 @@ class Cameras(Shown):
         Ks[:, 1, 2] *= down
         Ks[:, (0, 1), (0, 1)] *= np.minimum(across, down)[:, None]
         n = len(self)
-        return replace(self, Ks=Ks, widths=np.full(n, width), heights=np.full(n, height))
+        return replace(
+            self,
+            Ks=Ks,
+            widths=np.full(n, width),
+            heights=np.full(n, height),
+        )
 
     def _by(self, factor: Float) -> Cameras:
         """Return the views with a factor on the size of each."""
-        widths = np.maximum(1, np.rint(self.widths * factor)).astype(np.int64)
-        heights = np.maximum(1, np.rint(self.heights * factor)).astype(np.int64)
+        widths = np.rint(self.widths * factor)
+        widths = np.maximum(1, widths).astype(np.int64)
+        heights = np.rint(self.heights * factor)
+        heights = np.maximum(1, heights).astype(np.int64)
         Ks = self.Ks.copy()
         Ks[:, 0] *= (widths / self.widths)[:, None]
         Ks[:, 1] *= (heights / self.heights)[:, None]
-        return replace(self, Ks=Ks, widths=widths, heights=heights)
+        return replace(
+            self,
+            Ks=Ks,
+            widths=widths,
+            heights=heights,
+        )
 
     @property
     def size_text(self) -> str:
@@ -403,7 +431,9 @@ class Cameras(Shown):
             return f"{width}×{height} px"
         shortest = int(self.sides.min())
         longest = int(self.sides.max())
-        return f"{shortest}–{longest} px" if shortest < longest else f"{longest} px"
+        if shortest < longest:
+            return f"{shortest}–{longest} px"
+        return f"{longest} px"
 
     def cropped(self, low: ArrayLike, high: ArrayLike) -> Cameras:
         """Return the parts of the views from pixel `low` up to `high`, each (C, 2) or (2,), x before y.
@@ -481,6 +511,15 @@ class Cameras(Shown):
             kinds=tuple(kinds),
             lenses=tuple(lenses),
         )
+
+
+def within_frame(u: Values, v: Values, width: int, height: int) -> Mask:
+    """Return whether points of the image plane, in pixels, lie within an image of this size."""
+    inside: Mask = u >= 0
+    inside &= u < width
+    inside &= v >= 0
+    inside &= v < height
+    return inside
 
 
 def rows_by_kind(kinds: Sequence[str]) -> dict[str, list[int]]:

@@ -34,7 +34,10 @@ def fulfilling(splats: Splats, condition: str) -> Mask:
 
 
 def holds(
-    condition: str, names: Sequence[str], column: Callable[[str], Values], count: int
+    condition: str,
+    names: Sequence[str],
+    column: Callable[[str], Values],
+    count: int,
 ) -> Mask:
     """Return the (count,) mask of rows that fulfil a condition, see `fulfilling`.
 
@@ -91,7 +94,10 @@ _COMPARISONS: dict[type[ast.AST], Callable[[Any, Any], Any]] = {
     ast.Eq: np.equal,
     ast.NotEq: np.not_equal,
 }
-_SIGNS: dict[type[ast.AST], Callable[[Any], Any]] = {ast.USub: np.negative, ast.UAdd: np.positive}
+_SIGNS: dict[type[ast.AST], Callable[[Any], Any]] = {
+    ast.USub: np.negative,
+    ast.UAdd: np.positive,
+}
 _FUNCTIONS: dict[str, Callable[[list[Any]], Any]] = {
     "abs": lambda values: np.abs(*values),
     "sqrt": lambda values: np.sqrt(*values),

@@ -30,18 +30,21 @@ class KdTree:
     @property
     def leaves(self) -> int:
         """Number of leaves."""
-        return self.below.leaves + self.above.leaves if self.below and self.above else 1
+        if self.below and self.above:
+            return self.below.leaves + self.above.leaves
+        return 1
 
     def boxes(self) -> Float:
         """Return the (leaves, 2, 3) low and high corners, infinite where nothing was cut."""
-        boxes = [np.array([[-np.inf] * 3, [np.inf] * 3])]
-        if self.below and self.above:
-            below = self.below.boxes()
-            above = self.above.boxes()
-            below[:, 1, self.axis] = np.minimum(below[:, 1, self.axis], self.at)
-            above[:, 0, self.axis] = np.maximum(above[:, 0, self.axis], self.at)
-            boxes = [*below, *above]
-        return np.stack(boxes)
+        if not (self.below and self.above):
+            return np.array([[[-np.inf] * 3, [np.inf] * 3]])
+        below = self.below.boxes()
+        above = self.above.boxes()
+        lowest = above[:, 0, self.axis]
+        highest = below[:, 1, self.axis]
+        np.maximum(lowest, self.at, out=lowest)
+        np.minimum(highest, self.at, out=highest)
+        return np.concatenate([below, above])
 
     def route(self, points: Float32, margin: float = 0.0) -> Iterator[tuple[Rows, Rows]]:
         """Yield per leaf, in order, the rows in its box and the rows of other boxes within `margin`.
@@ -54,7 +57,11 @@ class KdTree:
         yield from self._route(columns, core, halo, margin)
 
     def _route(
-        self, columns: tuple[Float32, ...], core: Rows, halo: Rows, margin: float
+        self,
+        columns: tuple[Float32, ...],
+        core: Rows,
+        halo: Rows,
+        margin: float,
     ) -> Iterator[tuple[Rows, Rows]]:
         if not (self.below and self.above):
             yield core, np.sort(halo)
@@ -79,7 +86,12 @@ class KdTree:
 
         def build(node: KdTree) -> KdTree:
             if node.below and node.above:
-                return KdTree(node.axis, node.at, build(node.below), build(node.above))
+                return KdTree(
+                    node.axis,
+                    node.at,
+                    build(node.below),
+                    build(node.above),
+                )
             return parts.get(next(numbers), node)
 
         return build(self)
@@ -98,7 +110,12 @@ class KdTree:
         axis, at, below, above = content
         if axis not in (0, 1, 2) or not np.isfinite(at):
             raise ValueError(f"a cut at {at!r} along {axis!r}")
-        return cls(int(axis), float(at), cls.from_json(below), cls.from_json(above))
+        return cls(
+            int(axis),
+            float(at),
+            cls.from_json(below),
+            cls.from_json(above),
+        )
 
 
 def cut_tree(points: Float32, rows_each: float, most: int) -> KdTree:
@@ -115,7 +132,8 @@ def cut_tree(points: Float32, rows_each: float, most: int) -> KdTree:
     spans = np.ptp(points, axis=0)
     for axis in sorted(range(3), key=lambda a: (-sides[a], -spans[a], a)):
         values = np.sort(points[:, axis])
-        at = _find_between(values, len(values) * (parts // 2) / parts)
+        rank = len(values) * (parts // 2) / parts
+        at = _find_between(values, rank)
         if at is not None:
             is_below = points[:, axis] < at
             below = cut_tree(points[is_below], rows_each, most)
@@ -130,7 +148,8 @@ def parts_of(points: int, rows_each: float, most: int) -> int:
     parts = max(1, int(np.ceil(points * rows_each / most)))
     while parts < points:
         points_each = points / parts
-        if (points_each + sigmas * np.sqrt(points_each)) * rows_each <= most:
+        upper = points_each + sigmas * np.sqrt(points_each)
+        if upper * rows_each <= most:
             break
         parts += 1
     return parts
@@ -139,12 +158,14 @@ def parts_of(points: int, rows_each: float, most: int) -> int:
 def _find_between(values: Float32, rank: float) -> np.float32 | None:
     """Return the value, other than the minimum, whose rank is nearest to `rank`."""
     middle = values[min(int(rank), len(values) - 1)]
-    first = int(np.searchsorted(values, middle, "left"))
-    after = int(np.searchsorted(values, middle, "right"))
-    options = [cut for cut in (first, after) if 0 < cut < len(values)]
-    if not options:
+    cuts = [
+        int(np.searchsorted(values, middle, "left")),
+        int(np.searchsorted(values, middle, "right")),
+    ]
+    cuts = [cut for cut in cuts if 0 < cut < len(values)]
+    if not cuts:
         return None
-    value: np.float32 = values[min(options, key=lambda cut: (abs(cut - rank), cut))]
+    value: np.float32 = values[min(cuts, key=lambda cut: (abs(cut - rank), cut))]
     return value
 
 
@@ -159,7 +180,9 @@ def margin_of(tree: KdTree, points: Float32) -> float:
         low, high = np.percentile(points[core], _BOX_PERCENTILES, axis=0)
         _, middle, longest = np.sort(high.astype(np.float64) - low)
         sizes.append(float(np.sqrt(middle * longest)))
-    return _HALO_SHARE * float(np.median(sizes)) if sizes else 0.0
+    if not sizes:
+        return 0.0
+    return _HALO_SHARE * float(np.median(sizes))
 
 
 class Sampler:
@@ -169,7 +192,9 @@ class Sampler:
     """
 
     def __init__(self, count: int, size: int) -> None:
-        self.limit = min(1 << 32, max(1, (size << 32) // max(1, count)))
+        whole = 1 << 32
+        limit = size * whole // max(1, count)
+        self.limit = min(whole, max(1, limit))
         self._most = 2 * size
         self._held = 0
         self._points: list[Float32] = []
@@ -195,17 +220,22 @@ class Sampler:
 
     def result(self) -> tuple[Float32, float]:
         """Return (n, 3) points, and the number of rows per point."""
-        points = np.concatenate(self._points) if self._points else np.empty((0, 3), np.float32)
+        if self._points:
+            points = np.concatenate(self._points)
+        else:
+            points = np.empty((0, 3), np.float32)
         return points, (1 << 32) / self.limit
 
 
 def _hash(points: Float32) -> NDArray[np.uint32]:
     """Hash each row's bits to (N,) uint32, finished like MurmurHash3."""
     bits = np.ascontiguousarray(points).view(np.uint32)
-    h = bits[:, 0] * np.uint32(0x9E3779B1)
-    for axis, factor in ((1, 0x85EBCA77), (2, 0xC2B2AE3D)):
-        h ^= h >> np.uint32(15)
-        h = (h + bits[:, axis]) * np.uint32(factor)
+    x, y, z = bits.T
+    h = x * np.uint32(0x9E3779B1)
+    h ^= h >> np.uint32(15)
+    h = (h + y) * np.uint32(0x85EBCA77)
+    h ^= h >> np.uint32(15)
+    h = (h + z) * np.uint32(0xC2B2AE3D)
     h ^= h >> np.uint32(16)
     h *= np.uint32(0x85EBCA6B)
     h ^= h >> np.uint32(13)

@@ -29,11 +29,35 @@ PARAMETERS = {
 
 FACES: dict[str, Float] = {
     "front": np.eye(3),
-    "right": np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]]),
+    "right": np.array(
+        [
+            [0.0, 0, 1],
+            [0, 1, 0],
+            [-1, 0, 0],
+        ]
+    ),
     "back": np.diag([-1.0, 1, -1]),
-    "left": np.array([[0.0, 0, -1], [0, 1, 0], [1, 0, 0]]),
-    "up": np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]),
-    "down": np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]),
+    "left": np.array(
+        [
+            [0.0, 0, -1],
+            [0, 1, 0],
+            [1, 0, 0],
+        ]
+    ),
+    "up": np.array(
+        [
+            [1.0, 0, 0],
+            [0, 0, -1],
+            [0, 1, 0],
+        ]
+    ),
+    "down": np.array(
+        [
+            [1.0, 0, 0],
+            [0, 0, 1],
+            [0, -1, 0],
+        ]
+    ),
 }
 """Faces of a cube: rotations from a face's camera axes to the photo's."""
 
@@ -49,6 +73,17 @@ edge, fisheyes see nothing."""
 
 Face = tuple[str, Float, Float, tuple[int, int]]
 """A pinhole view of a photo: name, empty if it is the only one, rotation as in `FACES`, K and size."""
+
+
+def pinhole_matrix(fx: float, fy: float, cx: float, cy: float) -> Float:
+    """Return the (3, 3) intrinsics of focal lengths and a principal point in pixels."""
+    return np.array(
+        [
+            [fx, 0.0, cx],
+            [0.0, fy, cy],
+            [0.0, 0.0, 1.0],
+        ]
+    )
 
 
 @dataclass(frozen=True)
@@ -70,14 +105,20 @@ class PhotoLens:
     @property
     def focal(self) -> tuple[float, float]:
         """Pixels per radian, or per unit of the pinhole plane, in the middle."""
+        width, height = self.size
         if self.model == "EQUIRECTANGULAR":
-            return self.size[0] / (2 * np.pi), self.size[1] / np.pi
-        return (self.params[0], self.params[0 if self.model in _SINGLE_FOCAL else 1])
+            return width / (2 * np.pi), height / np.pi
+        if self.model in _SINGLE_FOCAL:
+            return self.params[0], self.params[0]
+        return self.params[0], self.params[1]
 
     @property
     def _centre_and_rest(self) -> tuple[float, float, tuple[float, ...]]:
-        first = 1 if self.model in _SINGLE_FOCAL else 2
-        return self.params[first], self.params[first + 1], self.params[first + 2 :]
+        if self.model in _SINGLE_FOCAL:
+            cx, cy, *rest = self.params[1:]
+        else:
+            cx, cy, *rest = self.params[2:]
+        return cx, cy, tuple(rest)
 
     def turned(self, turn: Float) -> PhotoLens:
         return replace(self, turn=tuple(turn.ravel().tolist()))
@@ -85,12 +126,14 @@ class PhotoLens:
     def project(self, rays: Float) -> tuple[Float, Mask]:
         """Map (N, 3) rays in the view's axes to (N, 2) pixels, and say which of them the photo holds."""
         x, y, z = np.array(self.turn).reshape(3, 3) @ rays.T
-        across = np.hypot(x, y)
         width, height = self.size
         if self.model == "EQUIRECTANGULAR":
-            u = (np.arctan2(x, z) / (2 * np.pi) + 0.5) * width
-            v = (np.arctan2(y, np.hypot(x, z)) / np.pi + 0.5) * height
+            longitude = np.arctan2(x, z)
+            latitude = np.arctan2(y, np.hypot(x, z))
+            u = (longitude / (2 * np.pi) + 0.5) * width
+            v = (latitude / np.pi + 0.5) * height
             return np.stack([u, v], 1), np.ones(len(u), bool)
+        across = np.hypot(x, y)
         if self.model in _PLANAR:
             inside = across < np.tan(_find_end(self)) * z
             ahead = np.where(inside, z, 1.0)
@@ -108,12 +151,15 @@ class PhotoLens:
         fx, fy = self.focal
         u = fx * u + cx
         v = fy * v + cy
-        inside &= (u >= 0) & (u <= width) & (v >= 0) & (v <= height)
+        inside &= (u >= 0) & (u <= width)
+        inside &= (v >= 0) & (v <= height)
         return np.stack([u, v], 1), inside
 
     def _plane_radius(self, angle: Float) -> Float:
         """Return the radius before distortion: the angle of fisheyes, otherwise its tangent."""
-        return np.tan(angle) if self.model in _PLANAR else angle
+        if self.model in _PLANAR:
+            return np.tan(angle)
+        return angle
 
     def _bent(self, u: Float, v: Float) -> tuple[Float, Float]:
         """Distort points by the lens: radially, tangentially (p1, p2), and by a thin prism (s1, s2)."""
@@ -129,43 +175,56 @@ class PhotoLens:
         elif self.model == "THIN_PRISM_FISHEYE":
             k1, k2, p1, p2, k3, k4, s1, s2 = rest
             k = (k1, k2, k3, k4)
-        k = (*k, *[0.0] * (6 - len(k)))
+        k1, k2, k3, k4, k5, k6, *_ = (*k, *[0.0] * 6)
         if self.model == "FULL_OPENCV":
-            above = 1 + r2 * (k[0] + r2 * (k[1] + r2 * k[2]))
-            radial = above / (1 + r2 * (k[3] + r2 * (k[4] + r2 * k[5])))
+            radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+            radial = radial / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
         else:
-            radial = 1 + r2 * (k[0] + r2 * (k[1] + r2 * (k[2] + r2 * k[3])))
-        return (
-            u * radial + 2 * p1 * u * v + p2 * (r2 + 2 * u * u) + s1 * r2,
-            v * radial + 2 * p2 * u * v + p1 * (r2 + 2 * v * v) + s2 * r2,
-        )
+            radial = 1 + r2 * (k1 + r2 * (k2 + r2 * (k3 + r2 * k4)))
+        bent_u = u * radial + 2 * p1 * u * v
+        bent_u = bent_u + p2 * (r2 + 2 * u * u)
+        bent_v = v * radial + 2 * p2 * u * v
+        bent_v = bent_v + p1 * (r2 + 2 * v * v)
+        return bent_u + s1 * r2, bent_v + s2 * r2
 
     def _measure_edges(self, radii: Float, angles: Float) -> Float:
         """Return the (4,) angles of the middles of the left, right, upper and lower edge."""
         cx, cy, _ = self._centre_and_rest
+        fx, fy = self.focal
         width, height = self.size
-        pixels = np.array([cx, width - cx, cy, height - cy])
-        return np.interp(pixels / np.repeat(self.focal, 2), radii, angles)
+        plane_edges = np.array(
+            [
+                cx / fx,
+                (width - cx) / fx,
+                cy / fy,
+                (height - cy) / fy,
+            ]
+        )
+        return np.interp(plane_edges, radii, angles)
 
     def faces(self, scale: float = 1.0) -> list[Face]:
         """Return the pinhole views of a photo of `scale` times the size: one of a narrow lens, otherwise the
         faces of a cube that it holds enough of."""
         if self.model == "FULL_OPENCV":
-            fx, fy, cx, cy = (scale * value for value in self.params[:4])
-            size = (round(self.size[0] * scale), round(self.size[1] * scale))
-            return [("", np.eye(3), np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), size)]
-        focal = scale * float(np.sqrt(self.focal[0] * self.focal[1]))
+            K = pinhole_matrix(*(scale * value for value in self.params[:4]))
+            width, height = self.size
+            return [("", np.eye(3), K, (round(width * scale), round(height * scale)))]
+        fx, fy = self.focal
+        focal = scale * float(np.sqrt(fx * fy))
         if self.model != "EQUIRECTANGULAR":
             angles = np.linspace(0, _find_end(self), 20001)[:-1]
-            radii = np.hypot(*self._bent(self._plane_radius(angles), np.zeros(len(angles))))
+            plane_radii = self._plane_radius(angles)
+            radii = np.hypot(*self._bent(plane_radii, np.zeros(len(angles))))
             edges = self._measure_edges(radii, angles)
             if edges.max() <= _ONE_VIEW:
                 left, right, top, bottom = (focal * np.tan(edge) for edge in edges)
-                K = np.array([[focal, 0, left], [0, focal, top], [0, 0, 1]])
-                size = (max(1, round(left + right)), max(1, round(top + bottom)))
-                return [("", np.eye(3), K, size)]
+                K = pinhole_matrix(focal, focal, left, top)
+                width = max(1, round(left + right))
+                height = max(1, round(top + bottom))
+                return [("", np.eye(3), K, (width, height))]
         side = max(2, round(2 * focal))
-        K = np.array([[side / 2, 0, side / 2], [0, side / 2, side / 2], [0, 0, 1]])
+        half = side / 2  # a face spans 90°, so this is also its focal length
+        K = pinhole_matrix(half, half, half, half)
         steps = (np.arange(32) + 0.5) / 16 - 1
         x, y = np.meshgrid(steps, steps)
         grid = np.stack([x.ravel(), y.ravel(), np.ones(x.size)], 1)
@@ -177,14 +236,23 @@ class PhotoLens:
         return found
 
 
-def _bend_by_fov(u: Float, v: Float, r2: Float, omega: float) -> tuple[Float, Float]:
+def _bend_by_fov(
+    u: Float,
+    v: Float,
+    r2: Float,
+    omega: float,
+) -> tuple[Float, Float]:
     """Distort points by the model of a wide lens with one parameter."""
     if abs(omega) < 1e-6:
         return u, v
     r = np.sqrt(r2)
     slope = np.tan(omega / 2)
     wide = np.arctan(2 * r * slope) / omega
-    factor = np.where(r > 1e-9, wide / np.maximum(r, 1e-9), 2 * slope / omega)
+    factor = np.where(
+        r > 1e-9,
+        wide / np.maximum(r, 1e-9),
+        2 * slope / omega,
+    )
     return u * factor, v * factor
 
 
@@ -193,14 +261,20 @@ def _find_end(lens: PhotoLens) -> float:
     """Return the angle from the axis where a lens ends: its radius stops growing, or the corners of a
     photo that shows the whole image circle begin."""
     planar = lens.model in _PLANAR
-    angles = np.linspace(0, np.pi / 2 if planar else np.pi, 20001)[:-1]
-    radii, _ = lens._bent(lens._plane_radius(angles), np.zeros(len(angles)))
+    widest = np.pi
+    if planar:
+        widest = np.pi / 2
+    angles = np.linspace(0, widest, 20001)[:-1]
+    plane_radii = lens._plane_radius(angles)
+    radii, _ = lens._bent(plane_radii, np.zeros(len(angles)))
     falls = np.flatnonzero(np.diff(radii) <= 0)
-    most = int(falls[0]) + 1 if len(falls) else len(angles)
-    end = float(angles[most - 1])
+    if len(falls):
+        angles = angles[: falls[0] + 1]
+        radii = radii[: falls[0] + 1]
+    end = float(angles[-1])
     if planar:
         return end
-    edge = float(lens._measure_edges(radii[:most], angles[:most]).max())
+    edge = float(lens._measure_edges(radii, angles).max())
     return min(end, max(edge, _CORNER))
 
 
@@ -210,8 +284,10 @@ def panorama_rays(width: int, height: int, rows: slice) -> Float:
     around = 2 * np.pi * (u / width - 0.5)
     down = np.pi * (v / height - 0.5)
     level = np.cos(down)
-    rays = np.stack([np.sin(around) * level, np.sin(down), np.cos(around) * level], axis=-1)
-    return rays.reshape(-1, 3)
+    x = np.sin(around) * level
+    y = np.sin(down)
+    z = np.cos(around) * level
+    return np.stack([x, y, z], axis=-1).reshape(-1, 3)
 
 
 def photo_of(name: str) -> str:

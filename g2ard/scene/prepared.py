@@ -105,7 +105,11 @@ def with_some_opacity(scene: PreparedScene) -> PreparedScene:
     Otherwise all rows would be dropped, or all have mass 0.
     """
     logits = scene.logit_opacities
-    raised = np.where(np.isinf(logits), logits, np.maximum(logits, _LEAST_LOGIT))
+    raised = np.where(
+        np.isinf(logits),
+        logits,
+        np.maximum(logits, _LEAST_LOGIT),
+    )
     return replace(scene, logit_opacities=raised)
 
 

@@ -34,16 +34,14 @@ def check_region(region: Sequence[float]) -> Region:
     """
     numbers = tuple(float(value) for value in region)
     if len(numbers) not in (4, 6) or not all(map(math.isfinite, numbers)):
-        raise InputError(
-            f"expected X,Y,Z,R or X,Y,Z,X,Y,Z, got {', '.join(f'{n:g}' for n in numbers)}",
-            parameter="region",
-        )
+        got = ", ".join(f"{n:g}" for n in numbers)
+        raise InputError(f"expected X,Y,Z,R or X,Y,Z,X,Y,Z, got {got}", parameter="region")
     if len(numbers) == 4 and not numbers[3] > 0:
         raise InputError(f"expected a radius > 0, got {numbers[3]:g}", parameter="region")
-    if len(numbers) == 6 and not all(
-        low < high for low, high in zip(numbers[:3], numbers[3:], strict=True)
-    ):
-        raise InputError("empty box; the lower corner comes first", parameter="region")
+    if len(numbers) == 6:
+        sides = zip(numbers[:3], numbers[3:], strict=True)
+        if not all(low < high for low, high in sides):
+            raise InputError("empty box; the lower corner comes first", parameter="region")
     return numbers
 
 
@@ -54,8 +52,10 @@ def as_regions(given: Sequence[Any]) -> tuple[Region, ...]:
     (((0.0, 0.0, 0.0, 2.0),), ((0.0, 0.0, 0.0, 2.0),))
     """
     try:
-        alone = len(given) > 0 and not np.ndim(given[0])
-        return tuple(check_region(region) for region in ([given] if alone else given))
+        regions = given
+        if len(given) > 0 and not np.ndim(given[0]):
+            regions = [given]
+        return tuple(check_region(region) for region in regions)
     except InputError:
         raise
     except (TypeError, ValueError):
@@ -97,7 +97,9 @@ def sky_mask(splats: Splats) -> Mask:
     away = np.linalg.norm(splats.means.astype(np.float64) - middle, axis=1)
     sky = away > reach
     middle_size, largest = longer_axes(splats.scales[sky].astype(np.float64)).T
-    covered = opacities[sky] * middle_size * largest / (2 * away[sky] ** 2)  # 2πσσ of 4π steradians
+    # 2πσσ of 4π steradians
+    covered = opacities[sky] * middle_size * largest
+    covered /= 2 * away[sky] ** 2
     if covered.sum() <= _LEAST_SKY_SHARE:
         sky[:] = False
     return sky
@@ -108,7 +110,9 @@ def _find_near_scene(splats: Splats, opacities: Float) -> tuple[Float, float]:
 
     Rows beyond are dropped and both are found again, because a sky moves the middle and widens the radius.
     """
-    rows = np.flatnonzero(splats.finite_rows() & (opacities > 1 / 255))
+    visible = splats.finite_rows()
+    visible &= opacities > 1 / 255
+    rows = np.flatnonzero(visible)
     rows = rows[:: max(1, -(-len(rows) // _RADIUS_SAMPLE))]
     middle = np.zeros(3)
     reach = np.inf

@@ -24,8 +24,10 @@ def quantile(values: Float, weights: Float, shares: Any) -> Float:
     """
     order = np.argsort(values)
     total = np.cumsum(weights[order])
-    at = np.searchsorted(total, np.asarray(shares) * total[-1])
-    return values[order][np.minimum(at, len(order) - 1)]
+    reached = np.asarray(shares) * total[-1]
+    at = np.searchsorted(total, reached)
+    at = np.minimum(at, len(order) - 1)
+    return values[order][at]
 
 
 def quantiles(points: Float, weights: Float, shares: Any) -> Float:
@@ -69,7 +71,10 @@ def _shorten_paths(root: Int) -> Int:
 
 def along(vectors: Float, axis: Float) -> Float:
     """Return (M,) dot products with one axis. A matrix product may change bits with the number of threads."""
-    return vectors[:, 0] * axis[0] + vectors[:, 1] * axis[1] + vectors[:, 2] * axis[2]
+    products = vectors[:, 0] * axis[0]
+    products += vectors[:, 1] * axis[1]
+    products += vectors[:, 2] * axis[2]
+    return products
 
 
 def norms(vectors: Float) -> Float:
@@ -108,7 +113,8 @@ def between(ends: Any, share: Float) -> Float:
     >>> float(between((10, 20), 0.3))
     13.0
     """
-    return ends[0] + (ends[1] - ends[0]) * share
+    low, high = ends
+    return low + (high - low) * share
 
 
 def directions(turn: Float, level: Float, height: ArrayLike) -> Float:
@@ -184,7 +190,7 @@ def strata(features: Float, size: int, seed: int) -> Values:
             groups.append(np.roll(rows, first))
             continue
         sides = np.ptp(features[rows], axis=0)
-        widest = int(np.argmax(sides))
+        widest = np.argmax(sides)
         rows = rows[np.argsort(features[rows, widest], kind="stable")]
         groups_inside = -(-len(rows) // size)  # rounded up
         cut = size * max(1, groups_inside // 2)  # so that only the last group is smaller
@@ -206,16 +212,18 @@ def merge_equal(points: Float, colors: Values) -> tuple[Rows, Values]:
     in_order = exact[order]
     new = np.ones(len(points), bool)  # in this order, whether each differs from the one before
     new[1:] = (in_order[1:] != in_order[:-1]).any(axis=1)
-    firsts = order[new]
     if new.all():
         return np.arange(len(points)), colors
+    firsts = order[new]
+    by_row = np.argsort(firsts)
     number = np.empty(len(firsts), np.intp)  # of each group, by its first row
-    number[np.argsort(firsts)] = np.arange(len(firsts))
+    number[by_row] = np.arange(len(firsts))
     group = np.empty(len(points), np.intp)
     group[order] = number[np.cumsum(new) - 1]
-    totals = [np.bincount(group, channel) for channel in colors.T]
     counts = np.bincount(group)
-    return np.sort(firsts), np.stack(totals, axis=1) / counts[:, None]
+    totals = [np.bincount(group, channel) for channel in colors.T]
+    means = np.stack(totals, axis=1) / counts[:, None]
+    return firsts[by_row], means
 
 
 def canonical_order(splats: Splats, rows: Values, most: int | None = None) -> Values:
@@ -230,13 +238,19 @@ def canonical_order(splats: Splats, rows: Values, most: int | None = None) -> Va
         limit = np.partition(key, most)[most]
         first = np.flatnonzero(key <= limit)
     order = first[np.argsort(key[first])]
-    same = key[order[1:]] == key[order[:-1]]
-    tied = np.append(same, False) | np.append(False, same)
+    in_order = key[order]
+    same = in_order[1:] == in_order[:-1]
+    tied = np.append(same, False)
+    tied |= np.append(False, same)
     if tied.any():
         among = order[tied]
         at = rows[among]
         # the last counts first
-        columns = [*splats.scales[at].T, *splats.means[at].T[::-1], key[among]]
+        columns = [
+            *splats.scales[at].T,
+            *splats.means[at].T[::-1],
+            key[among],
+        ]
         order[tied] = among[np.lexsort(columns)]
     return order[:most]
 
@@ -244,7 +258,12 @@ def canonical_order(splats: Splats, rows: Values, most: int | None = None) -> Va
 def _hash_looks(splats: Splats, rows: Values) -> NDArray[np.uint64]:
     """Return a hash of opacity, rotation and colour per row."""
     key = np.zeros(len(rows), np.uint64)
-    for block in (splats.logit_opacities[:, None], splats.quats, splats.sh0[:, 0]):
+    blocks = (
+        splats.logit_opacities[:, None],
+        splats.quats,
+        splats.sh0[:, 0],
+    )
+    for block in blocks:
         for column in block[rows].T:
             bits = np.ascontiguousarray(column + np.float32(0)).view(np.uint32)
             key ^= bits

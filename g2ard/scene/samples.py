@@ -19,7 +19,11 @@ def evenly_spaced(count: int, most: int, *, floor: bool = False) -> list[int]:
     ([0, 4, 8], [0, 1], [0, 2, 3], [0, 1, 3])
     """
     spaced = np.linspace(0, count - 1, min(count, most))
-    indices: list[int] = np.unique((np.floor if floor else np.round)(spaced).astype(int)).tolist()
+    if floor:
+        spaced = np.floor(spaced)
+    else:
+        spaced = np.round(spaced)
+    indices: list[int] = np.unique(spaced.astype(int)).tolist()
     return indices
 
 
@@ -32,7 +36,8 @@ class Takeable(Protocol[T_co]):
 
 def take_evenly(rows: Takeable[T], most: int, *, floor: bool = False) -> T:
     """Return at most `most` Gaussians or views, see `evenly_spaced`."""
-    return rows.take(np.array(evenly_spaced(len(rows), most, floor=floor), np.int64))
+    indices = evenly_spaced(len(rows), most, floor=floor)
+    return rows.take(np.array(indices, np.int64))
 
 
 def spread(count: int) -> Int:
@@ -56,4 +61,5 @@ def weighted_quantile(values: Values, weights: Values, share: float) -> float:
     """
     order = np.argsort(values, kind="stable")
     total = np.cumsum(weights[order])
-    return float(values[order[np.searchsorted(total, share * total[-1])]])
+    rank = np.searchsorted(total, share * total[-1])
+    return float(values[order[rank]])

@@ -42,10 +42,14 @@ def effective_rank(scales: Float32) -> Float:
     [3.0, 2.0, 1.0]
     """
     q = scales.astype(np.float64)
-    q /= np.maximum(q.sum(1, keepdims=True), np.finfo(np.float64).tiny)
-    return np.exp(-(q * np.log(np.maximum(q, np.finfo(np.float64).tiny))).sum(1))
+    tiny = np.finfo(np.float64).tiny
+    q /= np.maximum(q.sum(1, keepdims=True), tiny)
+    information = q * np.log(np.maximum(q, tiny))
+    return np.exp(-information.sum(1))
 
 
 def needle_share(scales: Float32) -> float:
     """Return the share of needles: Gaussians whose effective rank is below `NEEDLE_RANK`."""
-    return float((effective_rank(scales) < NEEDLE_RANK).mean()) if len(scales) else 0.0
+    if not len(scales):
+        return 0.0
+    return float((effective_rank(scales) < NEEDLE_RANK).mean())

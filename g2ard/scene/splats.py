@@ -94,7 +94,10 @@ class Splats(Shown):
             "shape (N, 3)",
         )
         n = len(self.means)
-        rest = self.shN.shape[1] if self.shN.ndim == 3 else -1
+        if self.shN.ndim == 3:
+            rest = self.shN.shape[1]
+        else:
+            rest = -1
         for name, shape in (
             ("quats", (n, 4)),
             ("scales", (n, 3)),
@@ -166,7 +169,12 @@ class Splats(Shown):
         """Opacities in [0, 1], (N,): the sigmoid of `logit_opacities`, without overflow."""
         x = self.logit_opacities.astype(np.float64)
         e = np.exp(-np.abs(x))
-        return np.where(x >= 0, 1 / (1 + e), e / (1 + e)).astype(np.float32)
+        opacities = np.where(
+            x >= 0,
+            1 / (1 + e),
+            e / (1 + e),
+        )
+        return opacities.astype(np.float32)
 
     @property
     def log_scales(self) -> Float32:
@@ -223,7 +231,10 @@ class Splats(Shown):
         """Return the scene with means relative to another offset (subtracted in float64)."""
         target = np.asarray(offset, np.float64)
         shift = self.offset - target
-        means = self.means if not shift.any() else (self.means.astype(np.float64) + shift)
+        if not shift.any():
+            means = self.means
+        else:
+            means = self.means.astype(np.float64) + shift
         return replace(self, means=means.astype(self.means.dtype), offset=target)
 
     def narrowed(self, offset: ArrayLike | None = None) -> Splats:
@@ -247,9 +258,15 @@ class Splats(Shown):
             if np.array_equal(exact, self.means, equal_nan=True):
                 return replace(self, means=exact)
             finite = self.scales[np.isfinite(self.scales).all(1)]
-            size = float(np.median(finite.max(1))) if len(finite) else 0.0
+            if len(finite):
+                size = float(np.median(finite.max(1)))
+            else:
+                size = 0.0
             shift = far_middle(self.means, size)
-            offset = self.offset + shift if shift.any() else self.offset
+            if shift.any():
+                offset = self.offset + shift
+            else:
+                offset = self.offset
         moved = self.recentred(offset)
         return replace(moved, means=np.ascontiguousarray(moved.means, np.float32))
 
@@ -291,9 +308,10 @@ def _as_floats(name: str, values: Any, kind: type[Any] | None = None) -> Values:
     """Return an array as float32; as `kind`, if given; means of more than 24 bits as float64."""
     dtype = getattr(values, "dtype", None)
     if kind is None:
-        kind = (
-            np.float64 if name == "means" and dtype not in (np.float32, np.float16) else np.float32
-        )
+        if name == "means" and dtype not in (np.float32, np.float16):
+            kind = np.float64
+        else:
+            kind = np.float32
     if isinstance(values, np.ndarray) and dtype == kind:
         return values
     try:
@@ -354,16 +372,22 @@ def far_middle(points: Values, size: float = 0.0) -> Float:
     """
     sample = points[:: max(1, len(points) // _SAMPLE)].astype(np.float64)
     sample = sample[np.isfinite(sample).all(1)]
+    none = np.zeros(3)
     if not len(sample):
-        return np.zeros(3)
+        return none
     low, middle, high = np.percentile(sample, (1, 50, 99), axis=0)
     farthest = np.abs(middle).max()
     spread = float(np.linalg.norm(high - low))
-    is_near = not farthest > _FAR_SPREADS * spread
-    if is_near or np.spacing(np.float32(farthest)) <= _FINE_STEP * size:
-        return np.zeros(3)
-    unit = 2.0 ** np.floor(np.log2(spread)) if spread > 0 else 1.0
-    unit = min(1.0, max(unit, float(np.spacing(farthest))))
+    if not farthest > _FAR_SPREADS * spread:
+        return none
+    if np.spacing(np.float32(farthest)) <= _FINE_STEP * size:
+        return none
+    if spread > 0:
+        unit = 2.0 ** np.floor(np.log2(spread))
+    else:
+        unit = 1.0
+    unit = max(unit, float(np.spacing(farthest)))
+    unit = min(1.0, unit)
     return np.rint(middle / unit) * unit
 
 
@@ -377,7 +401,8 @@ def unit_quats(quats: Float32) -> Float32:
     [[-1.0, 0.0, 0.0, 0.0], [0.0, 0.6000000238418579, 0.800000011920929, 0.0], [1.0, 0.0, 0.0, 0.0]]
     """
     lengths = np.linalg.norm(quats.astype(np.float64), axis=1)
-    off = np.isfinite(lengths) & (np.abs(lengths - 1) > _UNIT_SLACK)
+    off = np.abs(lengths - 1) > _UNIT_SLACK
+    off &= np.isfinite(lengths)
     if not off.any():
         return quats
     zero = lengths == 0

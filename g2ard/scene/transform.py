@@ -53,7 +53,10 @@ def transform(splats: Splats, matrix: ArrayLike) -> Splats:
     scale, rotation, shift = similarity(matrix)
     means = scale * splats.means.astype(np.float64) @ rotation.T
     offset = scale * splats.offset @ rotation.T
-    extent = float(np.linalg.norm(np.ptp(means, axis=0))) if len(means) else 0.0
+    if len(means):
+        extent = float(np.linalg.norm(np.ptp(means, axis=0)))
+    else:
+        extent = 0.0
     # An extent of 0 says nothing about the scene's size.
     far = 0 < _RECENTRE_EXTENTS * extent < np.abs(shift).max()
     if splats.offset.any() or far:
@@ -133,11 +136,13 @@ def deformed(splats: Splats, matrix: Float) -> tuple[Splats, bool]:
     if exact and det > 0:
         return placed(splats, matrix), True
     # Σ = A·Aᵀ with the scaled axes A, so M·A = U·S·Vᵀ gives the new axes U and scales S.
-    axes = rotation_matrices(splats.quats) * splats.scales.astype(np.float64)[:, None, :]
+    axes = rotation_matrices(splats.quats)
+    axes *= splats.scales.astype(np.float64)[:, None, :]
     frames, scales, _ = np.linalg.svd(linear @ axes)
     frames *= np.sign(np.linalg.det(frames))[:, None, None]
     shift = np.eye(4)
-    shift[:3, 3] = linear @ splats.offset + matrix[:3, 3] - splats.offset
+    shift[:3, 3] = linear @ splats.offset + matrix[:3, 3]
+    shift[:3, 3] -= splats.offset
     moved = placed(replace(splats, up=None), shift)
     if exact:
         shN = rotate_harmonics(splats.shN, np.sign(det) * turn)
@@ -160,9 +165,12 @@ def _warp(shN: Float32, linear: Float) -> Float32:
     before = directions @ np.linalg.inv(linear).T
     before /= np.linalg.norm(before, axis=1, keepdims=True)
     rest = shN.shape[1]
-    here = _evaluate_basis(directions)[:, :rest]
-    there = _evaluate_basis(before)[:, :rest]
-    return _recombine(shN, here, there).astype(np.float32)
+    warped = _recombine(
+        shN,
+        _evaluate_basis(directions)[:, :rest],
+        _evaluate_basis(before)[:, :rest],
+    )
+    return warped.astype(np.float32)
 
 
 def _draw_directions(count: int) -> Float:
@@ -196,12 +204,14 @@ def _to_quaternions(rotations: Float) -> Float32:
     for i in range(3):
         products[:, i + 1, i + 1] = 2 * r[:, i, i] - trace + 1
     for a, b, i, j, sign in _PRODUCTS:
-        products[:, a, b] = r[:, i, j] + sign * r[:, j, i]
-        products[:, b, a] = products[:, a, b]
+        product = r[:, i, j] + sign * r[:, j, i]
+        products[:, a, b] = product
+        products[:, b, a] = product
     squares = np.einsum("nii->ni", products)
     largest = squares.argmax(axis=1)
     quats = products[np.arange(len(r)), largest]
-    return (quats / np.linalg.norm(quats, axis=1, keepdims=True)).astype(np.float32)
+    quats /= np.linalg.norm(quats, axis=1, keepdims=True)
+    return quats.astype(np.float32)
 
 
 _PRODUCTS = (
@@ -222,13 +232,14 @@ def similarity(matrix: ArrayLike) -> tuple[float, Float, Float]:
         raise InputError(
             "expected 4×4 finite numbers, row-major, the last row 0 0 0 1", parameter="transform"
         )
-    det = float(np.linalg.det(m[:3, :3]))
+    linear = m[:3, :3]
+    det = float(np.linalg.det(linear))
     if det <= 0:
         raise InputError(
             f"mirrors or flattens the scene (its determinant is {det:g})", parameter="transform"
         )
     scale = det ** (1 / 3)
-    rotation = m[:3, :3] / scale
+    rotation = linear / scale
     if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4):
         raise InputError(
             "shears, or scales differently along different axes; Gaussians cannot follow",
@@ -259,7 +270,9 @@ def quaternion_of(rotation: Float) -> Float:
     )
     _, vectors = np.linalg.eigh(np.triu(upper) + np.triu(upper, 1).T)  # ascending
     q: Float = vectors[:, -1]
-    return q if q[0] >= 0 else -q
+    if q[0] >= 0:
+        return q
+    return -q
 
 
 def rotation_matrices(quats: NDArray[np.floating]) -> Float:
@@ -268,7 +281,8 @@ def rotation_matrices(quats: NDArray[np.floating]) -> Float:
     largest = np.abs(q).max(1, keepdims=True)  # divided by first, so that no square overflows
     scaled = q / np.where(largest > 0, largest, 1)
     q = np.where(largest > 0, scaled, [1.0, 0.0, 0.0, 0.0])
-    w, x, y, z = (q / np.linalg.norm(q, axis=1, keepdims=True)).T
+    q /= np.linalg.norm(q, axis=1, keepdims=True)
+    w, x, y, z = q.T
     matrices = np.empty((len(quats), 3, 3))
     matrices[:, 0, 0] = 1 - 2 * (y * y + z * z)
     matrices[:, 0, 1] = 2 * (x * y - w * z)
@@ -296,7 +310,11 @@ def rotate_harmonics(shN: Float32, rotation: Float) -> Float32:
         rows = slice(band * band - 1, (band + 1) ** 2 - 1)
         if rows.stop > shN.shape[1]:
             break
-        turned[:, rows] = _recombine(shN[:, rows], here[:, rows], there[:, rows])
+        turned[:, rows] = _recombine(
+            shN[:, rows],
+            here[:, rows],
+            there[:, rows],
+        )
     return turned
 
 
@@ -369,10 +387,13 @@ def with_axes(splats: Splats, matrix: Float) -> Splats:
     """
     sign = np.sign(np.linalg.det(matrix))
     turn = np.float32(sign) * matrix.astype(np.float32)
-    quats = np.concatenate([splats.quats[:, :1], splats.quats[:, 1:] @ turn.T], axis=1)
+    w = splats.quats[:, :1]
+    vector = splats.quats[:, 1:]
+    quats = np.concatenate([w, vector @ turn.T], axis=1)
     shN = rotate_harmonics(splats.shN, sign * matrix)
     if sign < 0:
-        shN *= harmonic_signs((-1, -1, -1))[: shN.shape[1], None]
+        signs = harmonic_signs((-1, -1, -1))
+        shN *= signs[: shN.shape[1], None]
     places = np.abs(matrix).argmax(axis=1)
     return replace(
         splats,
@@ -455,17 +476,24 @@ def join(scenes: Sequence[Splats]) -> Splats:
         raise InputError("no scenes", parameter="scenes")
     model = one_model([scene.render_model for scene in scenes])
     degree = max(scene.sh_degree for scene in scenes)
-    parts = [scene.recentred(scenes[0].offset).with_sh_degree(degree) for scene in scenes]
+    offset = scenes[0].offset
+    parts = [scene.recentred(offset).with_sh_degree(degree) for scene in scenes]
     together = {name: np.concatenate([getattr(part, name) for part in parts]) for name in ARRAYS}
     ups = {scene.up for scene in scenes}
-    up = ups.pop() if len(ups) == 1 else None
-    axes = common_axes([scene.axes for scene in scenes])
-    return Splats(**together, offset=scenes[0].offset, render_model=model, up=up, axes=axes)
+    return Splats(
+        **together,
+        offset=offset,
+        render_model=model,
+        up=ups.pop() if len(ups) == 1 else None,
+        axes=common_axes([scene.axes for scene in scenes]),
+    )
 
 
 def common_axes(axes: Sequence[Axes]) -> Axes:
     """Return the axes that all scenes share, or those of files."""
-    return axes[0] if len(set(axes)) == 1 else "RDF"
+    if len(set(axes)) == 1:
+        return axes[0]
+    return "RDF"
 
 
 def one_model(models: Sequence[RenderModel]) -> RenderModel:
