@@ -104,7 +104,12 @@ class Matter:
     horizon: float = np.inf
 
     @classmethod
-    def of(cls, splats: Splats, limit: int | None = None, represents: float = 1.0) -> Matter:
+    def of(
+        cls,
+        splats: Splats,
+        limit: int | None = None,
+        represents: float = 1.0,
+    ) -> Matter:
         """Weigh a scene's rows, drop invisible and distant ones, and normalise the rest.
 
         At most `limit` rows are used, as a fair sample. Each row of `splats` represents some Gaussians.
@@ -190,7 +195,7 @@ def _find_near(means: Float, weights: Float, votes: Votes) -> Mask:
         some = np.flatnonzero(near)[:_SAMPLE]
         centre = quantiles(means[some], weights[some], 0.5)
         distances = norms(means - centre)
-        typical = float(quantile(distances[some], weights[some], 2 / 3))
+        typical = quantile(distances[some], weights[some], 2 / 3)
         within = distances <= _FAR * typical
         if (within == near).all():
             break
@@ -219,13 +224,20 @@ class Grid:
     scale: Float32
 
     @classmethod
-    def of(cls, low: Float, high: Float, matter: Matter, axes: Float) -> Grid:
+    def of(
+        cls,
+        low: Float,
+        high: Float,
+        matter: Matter,
+        axes: Float,
+    ) -> Grid:
         """Fill the box from `low` to `high`, along the rows of `axes`."""
         count = len(matter.points)
         cells = int(np.clip(count, *_CELLS))
         if matter.represents > 1:
             cells = _CELLS_A_ROW * count
-        sides = np.maximum(high - low, np.max(high - low) * _LEAST_SIDE)
+        sides = high - low
+        sides = np.maximum(sides, sides.max() * _LEAST_SIDE)
         cell = float(np.cbrt(np.prod(sides) / cells))
         shape = np.maximum(1, np.ceil(sides / cell)).astype(int)
         depth, logs = _fill_cells(low, cell, shape, matter, axes)
@@ -262,9 +274,18 @@ class Grid:
     def _index(self, points: Float) -> tuple[Any, Mask]:
         return _index_cells(points, self.low, self.cell, np.array(self.murky.shape))
 
-    def cast(self, eyes: Float, directions: Float, *, murky: bool = False) -> Float:
+    def cast(
+        self,
+        eyes: Float,
+        directions: Float,
+        *,
+        murky: bool = False,
+    ) -> Float:
         """Return (M,) distances at which unit rays meet an opaque or a murky cell; inf without one."""
-        steps = self.murky if murky else self.opaque
+        if murky:
+            steps = self.murky
+        else:
+            steps = self.opaque
         return _core.cast_rays(
             steps.ravel(),
             list(steps.shape),
@@ -276,7 +297,11 @@ class Grid:
 
 
 def _fill_cells(
-    low: Float, cell: float, shape: Values, matter: Matter, axes: Float
+    low: Float,
+    cell: float,
+    shape: Values,
+    matter: Matter,
+    axes: Float,
 ) -> tuple[Float, Float]:
     """Spread the Gaussians over the cells that they cover.
 
@@ -294,7 +319,8 @@ def _fill_cells(
     sizes = 0.5 * np.log(positive(middle_scales * largest))
     faces = 2 * np.pi * middle_scales * largest / cell**2
     optical = matter.represents * matter.opacities * faces
-    parts = np.clip(np.ceil(_HALF_WIDTH * largest / cell), 1, _PARTS).astype(np.int8)
+    parts = np.ceil(_HALF_WIDTH * largest / cell)
+    parts = np.clip(parts, 1, _PARTS).astype(np.int8)
     for count in np.unique(parts).tolist():
         rows = np.flatnonzero(parts == count)
         spans = np.zeros((1, 2, 3))
@@ -305,22 +331,30 @@ def _fill_cells(
         for a, b in product(offsets, offsets):
             places = points[rows] + a * spans[:, 0] + b * spans[:, 1]
             index, inside = _index_cells(places, low, cell, shape)
+            cells = index[inside]
             here = rows[inside]
             share = optical[here] / count**2
-            np.add.at(filled, index[inside], share)
-            np.add.at(logs, index[inside], share * sizes[here])
+            np.add.at(filled, cells, share)
+            np.add.at(logs, cells, share * sizes[here])
     return filled, logs
 
 
-def _index_cells(points: Float, low: Float, cell: float, shape: Values) -> tuple[Any, Mask]:
+def _index_cells(
+    points: Float,
+    low: Float,
+    cell: float,
+    shape: Values,
+) -> tuple[Any, Mask]:
     """Return flat cell indices, clamped into the box, and whether each point was in it."""
     flat = np.zeros(len(points), np.int64)
     inside = np.ones(len(points), bool)
     for axis in range(3):
         count = shape[axis]
         place = np.floor((points[:, axis] - low[axis]) / cell)
-        inside &= (place >= 0) & (place < count)
-        flat = flat * count + np.clip(place, 0, count - 1).astype(np.int64)
+        inside &= place >= 0
+        inside &= place < count
+        flat *= count
+        flat += np.clip(place, 0, count - 1).astype(np.int64)
     return flat, inside
 
 

@@ -87,7 +87,12 @@ _COVERED = 0.75
 """Share of the frame that is covered for the full score."""
 
 
-def plan_orbit(survey: Survey, count: int, shift: int = 0, first: int | None = None) -> Poses:
+def plan_orbit(
+    survey: Survey,
+    count: int,
+    shift: int = 0,
+    first: int | None = None,
+) -> Poses:
     """Plan at most `count` poses around the centre of the matter, spread evenly over a dome.
 
     Each is as near as the object fits the frame. Poses below the ground, in matter or close to it are
@@ -96,22 +101,29 @@ def plan_orbit(survey: Survey, count: int, shift: int = 0, first: int | None = N
     site = survey.site
     target = site.box.mean(axis=0)
     farthest = _BELOW_SKY * site.horizon - norms((target - site.centre)[None])
+    heights = np.sin(np.radians(_ELEVATIONS))
 
     def tried(start: int, stop: int) -> tuple[Poses, Float]:
         turn, rise, chance = halton(start, stop, 3, survey.seed + shift).T
-        z = between(np.sin(np.radians(_ELEVATIONS)), rise)
+        z = between(heights, rise)
         outward = directions(turn, np.sqrt(1 - z * z), z)
         fitting = _fit_distances(site, target, outward, survey.lens)
-        distances = np.minimum(fitting * between(_DISTANCES, chance), farthest)
+        distances = fitting * between(_DISTANCES, chance)
+        distances = np.minimum(distances, farthest)
         poses = Poses(target + distances[:, None] * outward, -outward)
         free = site.is_free(poses.eyes, 2, _LOWEST)
-        clear = Rays(survey, poses).close > _CLEAR_CELLS * site.grid.cell
-        return poses, (free & clear).astype(float)
+        free &= Rays(survey, poses).close > _CLEAR_CELLS * site.grid.cell
+        return poses, free.astype(float)
 
     return gather(survey, count if first is None else min(first, count), tried)
 
 
-def _fit_distances(site: Site, target: Float, outward: Float, lens: Lens) -> Float:
+def _fit_distances(
+    site: Site,
+    target: Float,
+    outward: Float,
+    lens: Lens,
+) -> Float:
     """Return (P,) distances at which `_FITTING` of the matter is in frame, and all of it ahead."""
     points = site.points[:_OUTLINE] - target
     weights = site.weights[:_OUTLINE]
@@ -120,8 +132,11 @@ def _fit_distances(site: Site, target: Float, outward: Float, lens: Lens) -> Flo
     for i, frame in enumerate(Poses(outward, -outward).frames()):
         x, y, z = turned(points, frame).T
         # least depths that hold the points
-        in_frame = np.maximum(np.abs(x) / wide, np.abs(y) / tall)
-        distances[i] = quantile(in_frame - z, weights, _FITTING)
+        depths = np.maximum(
+            np.abs(x) / wide,
+            np.abs(y) / tall,
+        )
+        distances[i] = quantile(depths - z, weights, _FITTING)
     return np.maximum(distances, _OUTSIDE)
 
 
@@ -132,12 +147,17 @@ def ring(survey: Survey, rises: Sequence[float], turns: int) -> Poses:
     """
     site = survey.site
     points = site.points[:_OUTLINE]
-    rise, turn = np.meshgrid(np.radians(rises), np.arange(turns) / turns)
+    rise, turn = np.meshgrid(
+        np.radians(rises),
+        np.arange(turns) / turns,
+    )
     gazes = -directions_at(turn.ravel(), rise.ravel())
     eyes = np.empty_like(gazes)
     for i, frame in enumerate(Poses(gazes, gazes).frames()):
-        eyes[i] = _fit_eye(survey, turned(points, frame)) @ frame
-    return Poses(eyes, gazes).take(site.is_free(eyes, 2, _LOWEST))
+        eye = _fit_eye(survey, turned(points, frame))
+        eyes[i] = eye @ frame
+    free = site.is_free(eyes, 2, _LOWEST)
+    return Poses(eyes, gazes).take(free)
 
 
 def _fit_eye(survey: Survey, points: Float) -> Float:
@@ -150,9 +170,10 @@ def _fit_eye(survey: Survey, points: Float) -> Float:
     eye = np.zeros(3)
     for _ in range(_ROUNDS):
         away = _measure_away(survey, x - eye[0], y - eye[1]) - z
-        eye[2] = -float(quantile(away, weights, _WHOLE))
+        eye[2] = -quantile(away, weights, _WHOLE)
         ahead = np.flatnonzero(away <= -eye[2])
-        depths = np.maximum(z[ahead] - eye[2], _NEAREST)
+        depths = z[ahead] - eye[2]
+        depths = np.maximum(depths, _NEAREST)
         for axis, across in ((0, x), (1, y)):
             slopes = (across[ahead] - eye[axis]) / depths
             eye[axis] -= eye[2] * (slopes.max() + slopes.min()) / 2
@@ -164,7 +185,11 @@ def _measure_away(survey: Survey, x: Float, y: Float) -> Float:
     them, are in frame."""
     body = survey.site.body
     wide, tall = np.array(survey.lens.tangents) * _FILLED
-    return np.maximum((np.abs(x) + body) / wide, (np.abs(y) + body) / tall) + body
+    depths = np.maximum(
+        (np.abs(x) + body) / wide,
+        (np.abs(y) + body) / tall,
+    )
+    return depths + body
 
 
 def circle(survey: Survey, gazes: Float) -> Poses:
@@ -184,14 +209,20 @@ def circle(survey: Survey, gazes: Float) -> Poses:
         away = max(float(quantile(distances, weights, _WHOLE)) for distances in needed)
         slopes = []
         for (_, y, z), distances in zip(seen, needed, strict=True):
-            slope = (y - down) / np.maximum(z + away, _NEAREST)
+            depth = np.maximum(z + away, _NEAREST)
+            slope = (y - down) / depth
             slopes.append(slope[distances <= away])
         all_slopes = np.concatenate(slopes)
-        down += away * float(all_slopes.max() + all_slopes.min()) / 2
+        down += away * (all_slopes.max() + all_slopes.min()) / 2
     return Poses(target + down * frames[:, 1] - away * gazes, gazes)
 
 
-def plan_aerial(survey: Survey, count: int, shift: int = 0, first: int | None = None) -> Poses:
+def plan_aerial(
+    survey: Survey,
+    count: int,
+    shift: int = 0,
+    first: int | None = None,
+) -> Poses:
     """Plan at most `count` poses above everything, their footprints spread evenly over the scene.
 
     Some look straight down and the others obliquely to all sides. The height follows from `count`: few poses
@@ -200,21 +231,26 @@ def plan_aerial(survey: Survey, count: int, shift: int = 0, first: int | None = 
     """
     site = survey.site
     height = _choose_height(site, count, survey.lens)
-    inset = _INSET * site.sides
+    low = site.box[0] + _INSET * site.sides
+    sides = site.sides - 2 * (_INSET * site.sides)
 
     def tried(start: int, stop: int) -> tuple[Poses, Float]:
         x, y, kind, turn, pitch, chance = halton(start, stop, 6, survey.seed + shift).T
-        spots = site.box[0] + inset + (site.sides - 2 * inset) * np.stack([x, y, x], axis=1)
+        spots = low + sides * np.stack([x, y, x], axis=1)
         spots[:, 2] = site.ground(spots)
         nadir = kind < _NADIR
         oblique = np.radians(between(_PITCHES, pitch))
         down = np.where(nadir, np.pi / 2, oblique)
-        gazes = directions(turn, np.where(nadir, 0.0, np.cos(down)), -np.sin(down))
-        away = height * (_LEAST_HEIGHT + _HEIGHT_RANGE * chance) / np.sqrt(np.sin(down))
+        level = np.where(nadir, 0.0, np.cos(down))
+        gazes = directions(turn, level, -np.sin(down))
+        away = height * (_LEAST_HEIGHT + _HEIGHT_RANGE * chance)
+        away /= np.sqrt(np.sin(down))
         poses = Poses(spots - away[:, None] * gazes, gazes)
         seen = Rays(survey, poses)
-        clear = site.is_free(poses.eyes, 3, 0.0) & (seen.close > _CLEAR * height)
-        return poses, np.where(clear, seen.covered / _COVERED, 0.0)
+        clear = site.is_free(poses.eyes, 3, 0.0)
+        clear &= seen.close > _CLEAR * height
+        scores = np.where(clear, seen.covered / _COVERED, 0.0)
+        return poses, scores
 
     return gather(survey, count if first is None else min(first, count), tried)
 
@@ -224,10 +260,12 @@ def _choose_height(site: Site, count: int, lens: Lens) -> float:
 
     It is at most the height from which one frame spans the scene, and always above what stands on the ground.
     """
-    sides = site.sides[:2]
     wide, tall = lens.tangents
+    x_side, y_side = site.sides[:2]
     nadir_views = max(1.0, _NADIR * count)
     # A frame from height h covers 4 h² wide·tall of the ground.
-    by_count = np.sqrt(_OVERLAP * sides[0] * sides[1] / (nadir_views * 4 * wide * tall))
-    fits = min(sides) / (2 * min(wide, tall))
-    return float(max(min(by_count, fits), _ABOVE * site.tallness))
+    covered = nadir_views * 4 * wide * tall
+    by_count = np.sqrt(_OVERLAP * x_side * y_side / covered)
+    fits = min(x_side, y_side) / (2 * min(wide, tall))
+    highest = min(by_count, fits)
+    return float(max(highest, _ABOVE * site.tallness))

@@ -202,13 +202,15 @@ def plan_pool(
         survey = replace(survey, lens=Lens(size, WIDE))
     poses, used, why = _plan(survey, kind, count)
     held = _measure_share_held(survey, poses)
-    wanted = round(count * max(1.0, min(grow, 1 / np.sqrt(held))))
+    growth = min(grow, 1 / np.sqrt(held))
+    wanted = round(count * max(1.0, growth))
     if len(poses) == count and wanted > _WORTH * count:
         first = poses
         before = used
         poses, used, why = _plan(survey, kind, wanted)
         if set(before) - set(used):  # more poses from above are lower, and may be judged otherwise
-            poses = Poses.joined([first, poses.take(_spread_rows(len(poses), wanted - count))])
+            further = _spread_rows(len(poses), wanted - count)
+            poses = Poses.joined([first, poses.take(further)])
             used = list(dict.fromkeys([*before, *used]))
     if len(poses) < count:
         raise InputError(
@@ -277,7 +279,13 @@ def _plan(survey: Survey, kind: str, count: int) -> tuple[Poses, list[str], str]
     return Poses.joined([*parts.values()]).take(slice(count)), [*parts], why
 
 
-def _plan_more(survey: Survey, poses: Poses, reach: Reach, kind: str, count: int) -> list[Camera]:
+def _plan_more(
+    survey: Survey,
+    poses: Poses,
+    reach: Reach,
+    kind: str,
+    count: int,
+) -> list[Camera]:
     """Plan `Pool.more` views; near ones step from `poses`, with another seed than the pool's own."""
     survey.tell(0, 0)
     wide = replace(survey, lens=Lens(survey.lens.size, WIDE))
@@ -342,7 +350,10 @@ def _add_from_outside(survey: Survey, mix: _Mix) -> list[str]:
     why = ["a landscape" if landscape else "an object"]
     plan = _PLANNERS[kind]
     sharp = _see_sharply(survey, plan(survey, mix.missing, first=_SAMPLED))
-    share = float(sharp.mean()) if len(sharp) else 1.0
+    if len(sharp):
+        share = float(sharp.mean())
+    else:
+        share = 1.0
     if share < _FEW:
         why.append(f"from around or above it looks blurred ({share:.0%} of the poses are sharp)")
         far = Poses.joined([])

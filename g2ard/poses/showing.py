@@ -114,7 +114,12 @@ class Outlook:
     spread: Float
 
     @classmethod
-    def of(cls, survey: Survey, cameras: Cameras, full: float = -1.0) -> Outlook:
+    def of(
+        cls,
+        survey: Survey,
+        cameras: Cameras,
+        full: float = -1.0,
+    ) -> Outlook:
         """Look through the views, whose covered share to the power of `full` counts."""
         glance = survey.outlook
         within = survey.site.encloses(survey.site.localize(glance.points))
@@ -135,10 +140,15 @@ def _look_from_within(survey: Survey, every: int = 1) -> Outlook:
     wide = replace(survey, lens=Lens(survey.lens.size, WIDE))
     count = _STANDING // every
     poses = Poses.joined(
-        [plan_inside(wide, count), plan_walk(wide, count), plan_sharp(wide, count)]
+        [
+            plan_inside(wide, count),
+            plan_walk(wide, count),
+            plan_sharp(wide, count),
+        ]
     )
     pitch = poses.gazes[:, 2]
-    level = poses.take((pitch > _GAZES[0]) & (pitch < _GAZES[1]))
+    lowest, highest = _GAZES
+    level = poses.take((pitch > lowest) & (pitch < highest))
     return Outlook.of(survey, wide.cameras(level), _FULL)
 
 
@@ -158,7 +168,8 @@ def _is_roofed(survey: Survey) -> bool:
     if site.terrain is None:
         return False
     places = between(site.box, halton(0, _PLACES, 3, 0))
-    above = closed(site, places[site.is_free(places, 2)], 16, 0.5, 1.0)
+    places = places[site.is_free(places, 2)]
+    above = closed(site, places, 16, 0.5, 1.0)
     return bool((above > 0.5).sum() > _ROOFED * len(above))
 
 
@@ -169,14 +180,18 @@ def is_walled(survey: Survey) -> bool:
     if site.terrain is None:
         return False
     at = halton(0, _PLACES, 3, 1)
-    places = site.place_at(at, site.tallness * between(_HEIGHTS, at[:, 2]))
+    heights = site.tallness * between(_HEIGHTS, at[:, 2])
+    places = site.place_at(at, heights)
     places = places[site.is_free(places, 2)]
-    within = places[closed(site, places, 24, -_HORIZON, _HORIZON) > _WALLED]
+    walled = closed(site, places, 24, -_HORIZON, _HORIZON)
+    within = places[walled > _WALLED]
     if len(within) <= len(places) / 2:
         return False
+    eyes = ring(survey, _RISES[1:2], _TURNS).eyes
+    if not len(eyes):
+        return False
     votes = survey.votes
-    around = votes.at(ring(survey, _RISES[1:2], _TURNS).eyes)
-    return bool(len(around) and around.mean() < _FINER * votes.at(within).mean())
+    return bool(votes.at(eyes).mean() < _FINER * votes.at(within).mean())
 
 
 def _sees_less(around: Outlook, within: Outlook) -> bool:
@@ -256,10 +271,11 @@ def turntable(
     if kind == "photos":
         assert cameras is not None
         away = _measure_subject_distance(survey, best)
-        eyes = turned((cameras.positions - site.origin) / site.size, site.axes)
-        offsets = eyes - (eye + away * gaze)
+        eyes = (cameras.positions - site.origin) / site.size
+        offsets = turned(eyes, site.axes) - (eye + away * gaze)
         photo_angles = np.arctan2(offsets[:, 1], offsets[:, 0])
-        angles = _turn_within_arc(angles, photo_angles - np.arctan2(-gaze[1], -gaze[0]))
+        first_angle = np.arctan2(-gaze[1], -gaze[0])
+        angles = _turn_within_arc(angles, photo_angles - first_angle)
     gazes = around(gaze, angles)
     if kind == "around":
         poses = circle(survey, gazes)
@@ -268,9 +284,11 @@ def turntable(
     across = first.width / first.K[0, 0]
     down = first.height / first.K[1, 1]
     half = max(across, down * size[0] / size[1]) / 2  # tangent of half the field of view
-    lens = Lens(size, 2 * float(np.degrees(np.arctan(half))))
+    half_angle = np.degrees(np.arctan(half))
+    lens = Lens(size, 2 * float(half_angle))
     views = replace(survey, lens=lens).cameras(poses)
-    return replace(views, names=tuple(f"{i:04d}" for i in range(count))), site.axes[2]
+    names = tuple(f"{i:04d}" for i in range(count))
+    return replace(views, names=names), site.axes[2]
 
 
 def _measure_subject_distance(survey: Survey, best: Cameras) -> float:
@@ -292,7 +310,7 @@ def _turn_within_arc(angles: Float, seen: Float) -> Float:
     """
     order = np.sort(np.append(seen % (2 * np.pi), 0.0))
     gaps = np.diff(order, append=2 * np.pi)
-    widest = int(np.argmax(gaps))
+    widest = np.argmax(gaps)
     if gaps[widest] < _GAP:
         return angles
     high = order[widest]
@@ -305,7 +323,8 @@ def _create_survey(splats: Splats, size: tuple[int, int], axis: ArrayLike | None
     rows = splats.visible_rows()
     some = splats.take(rows[canonical_order(splats, rows, _ROWS)])
     represents = len(rows) / max(1, len(some))
-    some = some.take(some.finite_rows()) if len(some) else some
+    if len(some):
+        some = some.take(some.finite_rows())
     return Survey(some, represents, Site.of(some, axis, None, represents), Lens(size))
 
 
@@ -316,32 +335,40 @@ def _find_best(survey: Survey, count: int, cameras: Cameras | None) -> tuple[Cam
         worth = look.detail * _measure_wholeness(survey, look)
         return look.cameras.take(_choose(look, worth, count)), "photos"
     look, kind = _plan_looks(survey)
-    worth = look.detail if kind == "within" else look.detail * look.spread
+    if kind == "within":
+        worth = look.detail
+    else:
+        worth = look.detail * look.spread
     found = look.cameras.take(_choose(look, worth, count))
     if not len(found):
         raise InputError("no free place has a view of the scene; give views")
-    return replace(found, names=tuple(f"view_{i:04d}" for i in range(len(found)))), kind
+    names = tuple(f"view_{i:04d}" for i in range(len(found)))
+    return replace(found, names=names), kind
 
 
 def _measure_wholeness(survey: Survey, look: Outlook) -> Float:
     """Return (V,) how much photos show of their subject, which most have in the middle, and how whole."""
+    points = survey.outlook.points
     # From 0 in the middle of the image to 1 at its edge, (V, N).
-    outward = np.stack([camera.outward(survey.outlook.points) for camera in look.cameras])
+    outward = np.stack([camera.outward(points) for camera in look.cameras])
     centrality = np.exp(-np.square(outward / _MIDDLE) / 2)
     middle = (look.seen * centrality).mean(axis=0)
-    # of the subject, per Gaussian
-    share = np.sqrt(middle / np.maximum(look.seen.max(axis=0), 1e-30))
+    most_seen = np.maximum(look.seen.max(axis=0), 1e-30)
+    share = np.sqrt(middle / most_seen)  # of the subject, per Gaussian
     shown = (look.seen * share).sum(axis=1)
+    shown /= max(shown.max(), 1e-30)
     uncut = np.clip((1 - outward) / _EDGE, 0, 1)
+    subject = middle * share
     within = (uncut * middle * share).sum(axis=1)
-    within /= max(float((middle * share).sum()), 1e-30)
-    return shown / max(float(shown.max()), 1e-30) * within**_UNCUT
+    within /= max(subject.sum(), 1e-30)
+    return shown * within**_UNCUT
 
 
 def _choose(look: Outlook, worth: Float, count: int) -> list[int]:
     """Return clear views in order of what they add, times their worth."""
     clear = look.clear + _LEAST
-    worth = np.where(clear >= _CLEAR * clear.max(initial=0), worth * clear, 0.0)
+    is_clear = clear >= _CLEAR * clear.max(initial=0)
+    worth = np.where(is_clear, worth * clear, 0.0)
     total = look.seen.sum(axis=1, dtype=np.float64)
     forwards = look.cameras.forwards
     least = np.full(len(total), np.inf)  # degrees to the nearest chosen view
@@ -349,7 +376,8 @@ def _choose(look: Outlook, worth: Float, count: int) -> list[int]:
     chosen: list[int] = []
     while len(chosen) < min(count, len(total)):
         new = np.maximum(look.seen - union, 0).sum(axis=1, dtype=np.float64)
-        value = worth * (new + _AGAIN * total) * np.minimum(1, least / _APART)
+        value = worth * (new + _AGAIN * total)
+        value *= np.minimum(1, least / _APART)
         best = int(np.argmax(value))
         if not value[best] > 0:
             break

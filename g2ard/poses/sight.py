@@ -16,6 +16,7 @@ from g2ard.poses.site import Inside, Site
 from g2ard.poses.votes import Votes
 from g2ard.rendering.renderer import RasterSettings, View, view_of
 from g2ard.scene.cameras import Cameras
+from g2ard.scene.lenses import pinhole_matrix
 from g2ard.scene.reproducible import canonical_order, norms, positive, quantile, turned
 from g2ard.scene.splats import Splats
 from g2ard.system.cached import cached_property
@@ -86,7 +87,10 @@ class Lens:
     def holds(self, x: Float, y: Float, z: Float) -> Mask:
         """Return (M,) whether points, right, down and ahead of the eye, are in the frame."""
         wide, tall = self.tangents
-        return (z > 0) & (np.abs(x) < wide * z) & (np.abs(y) < tall * z)
+        held = z > 0
+        held &= np.abs(x) < wide * z
+        held &= np.abs(y) < tall * z
+        return held
 
     @property
     def focal(self) -> float:
@@ -97,7 +101,7 @@ class Lens:
     def matrix(self) -> Float:
         """(3, 3) pinhole intrinsics in pixels."""
         width, height = self.size
-        return np.array([[self.focal, 0, width / 2], [0, self.focal, height / 2], [0, 0, 1]])
+        return pinhole_matrix(self.focal, self.focal, width / 2, height / 2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,9 +122,10 @@ class Poses:
     def joined(cls, parts: list[Poses]) -> Poses:
         """Concatenate the poses of all parts, in order."""
         none = np.zeros((0, 3))
-        eyes = [p.eyes for p in parts]
-        gazes = [p.gazes for p in parts]
-        return cls(np.concatenate([none, *eyes]), np.concatenate([none, *gazes]))
+        return cls(
+            np.concatenate([none, *(part.eyes for part in parts)]),
+            np.concatenate([none, *(part.gazes for part in parts)]),
+        )
 
     def frames(self) -> Float:
         """Return (P, 3, 3) rotations whose rows are right, down and ahead, in the site's coordinates."""
@@ -129,7 +134,8 @@ class Poses:
         steep = np.linalg.norm(level, axis=1) < 1e-6
         level[steep] = (1.0, 0.0, 0.0)
         right = level / np.linalg.norm(level, axis=1, keepdims=True)
-        return np.stack([right, np.cross(self.gazes, right), self.gazes], axis=1)
+        down = np.cross(self.gazes, right)
+        return np.stack([right, down, self.gazes], axis=1)
 
 
 class Glance:
@@ -141,21 +147,29 @@ class Glance:
         limit: largest number of Gaussians to render.
     """
 
-    def __init__(self, splats: Splats, represents: float = 1.0, limit: int = _ROWS) -> None:
+    def __init__(
+        self,
+        splats: Splats,
+        represents: float = 1.0,
+        limit: int = _ROWS,
+    ) -> None:
         rows = splats.visible_rows()
         some = rows[canonical_order(splats, rows, limit)]
         sample = splats.take(some[splats.take(some).finite_rows()])
-        scales = np.sort(sample.scales.astype(np.float64), axis=1)
-        self.sizes = np.sqrt(scales[:, 1] * scales[:, 2])
+        _, middle_scales, largest = np.sort(sample.scales.astype(np.float64), axis=1).T
+        self.sizes = np.sqrt(middle_scales * largest)
         self.opacities = sample.opacities
         self._middle = sample.offset + np.median(sample.means.astype(np.float64), axis=0)
         self._means = sample.positions - self._middle
         self.points = self._means + self._middle
         self._antialiased = sample.antialiased
         self._colors = np.clip(sample.colors.astype(np.float64), 0, 1)
+        # the sample covers as much as the scene, but for the axis along which Gaussians are flat
         most = _MOST_WIDENED * limit / _ROWS
-        widen = min(most, np.sqrt(represents * len(rows) / max(1, len(some))))
-        is_shortest = np.arange(3) == np.argmin(sample.scales, axis=1)[:, None]
+        represented = represents * len(rows) / max(1, len(some))
+        widen = min(most, np.sqrt(represented))
+        shortest = np.argmin(sample.scales, axis=1)
+        is_shortest = np.arange(3) == shortest[:, None]
         logs = np.log(np.maximum(sample.scales, np.finfo(np.float32).tiny))
         arrays = (
             self._means,
@@ -176,16 +190,21 @@ class Glance:
             too close to the camera have large ones. Matter beyond `reach`, (C,), counts only for the first.
         """
         figures = np.zeros((3, len(cameras)))
-        for i, (sums, depth, view) in enumerate(self._renders(cameras, self._near_of(cameras))):
+        near = self._near_of(cameras)
+        for i, (sums, depth, view) in enumerate(self._renders(cameras, near)):
             weight = sums["weight"] / np.prod(view[2])
-            farthest = np.inf if reach is None else reach[i]
-            seen = (weight > 0) & (depth <= farthest)
-            figures[:, i] = weight.sum(), 0.0, np.inf
+            seen = weight > 0
+            if reach is not None:
+                seen &= depth <= reach[i]
+            covered = weight.sum()
+            fine = 0.0
+            coarsest = np.inf
             if seen.any():
                 angle = self.sizes[seen] / positive(depth[seen])
                 seen_weight = weight[seen]
-                figures[1, i] = seen_weight[angle < _FINE].sum()
-                figures[2, i] = quantile(angle, seen_weight, _COARSEST)
+                fine = seen_weight[angle < _FINE].sum()
+                coarsest = float(quantile(angle, seen_weight, _COARSEST))
+            figures[:, i] = covered, fine, coarsest
         return figures
 
     def _near_of(self, cameras: Cameras) -> float | None:
@@ -209,14 +228,15 @@ class Glance:
         rasterizer = _core.Rasterizer()
         settings = RasterSettings(antialiased=self._antialiased, near=near)
         for i, (sums, depth, view) in enumerate(self._renders(cameras, near)):
-            image = np.clip(rasterizer.image(self._arrays, view, settings, list(BLACK)), 0, 1)
+            image = rasterizer.image(self._arrays, view, settings, list(BLACK))
+            image = np.clip(image, 0, 1)
             weight = sums["weight"] / image[..., 0].size
             covered[i] = weight.sum()
             fine[i] = weight[self.sizes < _FINE * depth].sum()
             seen[i] = sums["transmittance"] / np.maximum(1, sums["hits"])
-            detail[i] = sum(
-                np.abs(np.diff(image, axis=axis)).mean(dtype=np.float64) for axis in (0, 1)
-            )
+            for axis in (0, 1):
+                differences = np.abs(np.diff(image, axis=axis))
+                detail[i] += differences.mean(dtype=np.float64)
             shown = sums["weight"].astype(np.float64)
             variances = [_measure_variance(channel, shown) for channel in self._colors.T]
             spread[i] = np.sqrt(sum(variances))
@@ -239,11 +259,15 @@ class Glance:
         """Return the (C,) shares of the images that show matter nearer than `close`, scene units."""
         shares = np.zeros(len(cameras))
         for i, (sums, depth, view) in enumerate(self._renders(cameras, _NEAR * close)):
-            shares[i] = sums["weight"][depth < close].sum() / np.prod(view[2])
+            is_close = depth < close
+            shares[i] = sums["weight"][is_close].sum() / np.prod(view[2])
         return shares
 
     def _renders(
-        self, cameras: Cameras, near: float | None, crop: bool = False
+        self,
+        cameras: Cameras,
+        near: float | None,
+        crop: bool = False,
     ) -> Iterator[tuple[dict[str, Any], Float, View]]:
         """Yield each camera's sums, the distances to the Gaussians, and the view as kernels take it."""
         if not len(cameras):
@@ -251,9 +275,10 @@ class Glance:
         here = cameras.resized(_LONGEST).recentred(self._middle)
         if crop:
             sizes = np.stack([here.widths, here.heights], axis=1)
-            low = np.maximum(0, (sizes - _CROP) // 2)
-            high = np.minimum(sizes, (sizes + _CROP) // 2)
-            here = here.cropped(low, high)
+            here = here.cropped(
+                np.maximum(0, (sizes - _CROP) // 2),
+                np.minimum(sizes, (sizes + _CROP) // 2),
+            )
         settings = RasterSettings(antialiased=self._antialiased, near=near)
         for first in range(0, len(here), _BATCH):
             batch = range(first, min(first + _BATCH, len(here)))
@@ -264,9 +289,10 @@ class Glance:
 
 
 def _measure_variance(values: Float, weights: Float) -> float:
-    total = max(float(weights.sum()), 1e-30)
-    mean = float((weights * values).sum()) / total
-    return float((weights * (values - mean) ** 2).sum()) / total
+    total = max(weights.sum(), 1e-30)
+    mean = (weights * values).sum() / total
+    squares = (values - mean) ** 2
+    return float((weights * squares).sum()) / total
 
 
 @dataclass(frozen=True, eq=False)
@@ -299,8 +325,12 @@ class Survey:
         """Votes of the scene's Gaussians for places in the site's coordinates."""
         site = self.site
         glance = self.glance
-        points = turned((glance.points - site.origin) / site.size, site.axes)
-        return Votes.of(points, glance.sizes / site.size, glance.opacities.astype(np.float64))
+        points = (glance.points - site.origin) / site.size
+        return Votes.of(
+            turned(points, site.axes),
+            glance.sizes / site.size,
+            glance.opacities.astype(np.float64),
+        )
 
     @cached_property
     def glance(self) -> Glance:
@@ -337,12 +367,20 @@ class Rays:
         columns, rows = _RAYS
         x = wide * ((np.arange(columns) + 0.5) / columns * 2 - 1)
         y = tall * ((np.arange(rows) + 0.5) / rows * 2 - 1)
-        rays = np.stack([np.tile(x, rows), np.repeat(y, columns), np.ones(columns * rows)], axis=1)
+        rays = np.stack(
+            [
+                np.tile(x, rows),
+                np.repeat(y, columns),
+                np.ones(columns * rows),
+            ],
+            axis=1,
+        )
         rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+        directions = np.einsum("ri,pij->prj", rays, poses.frames())
         self._site = survey.site
         self._shape = (len(poses), len(rays))
         self._eyes = np.repeat(poses.eyes, len(rays), axis=0)
-        self._directions = np.einsum("ri,pij->prj", rays, poses.frames()).reshape(-1, 3)
+        self._directions = directions.reshape(-1, 3)
 
     @cached_property
     def _stopped(self) -> Float:
@@ -363,7 +401,8 @@ class Rays:
         """Share of the rays stopped by matter that stands on the ground; all of it without a ground."""
         hit = np.isfinite(self._stopped)
         points = self._eyes[hit] + self._stopped[hit, None] * self._directions[hit]
-        hit[hit] = self._site.above_ground(points) > _RAISED * self._site.tallness
+        heights = self._site.above_ground(points)
+        hit[hit] = heights > _RAISED * self._site.tallness
         return hit.reshape(self._shape).mean(axis=1)
 
     @property
@@ -397,7 +436,11 @@ def gather(
     asked = 0
     good = 0
     while good < count and asked < patience * count:
-        more = min(max(count - good, 16), patience * count - asked, _BLOCK)
+        more = min(
+            max(count - good, 16),
+            patience * count - asked,
+            _BLOCK,
+        )
         poses, judged = tried(asked, asked + more)
         parts.append(poses)
         scores = np.concatenate([scores, judged])

@@ -147,8 +147,12 @@ class Site:
         """
         matter = Matter.of(splats, rows, represents)
         some = matter.first()
-        axis = splats.up if axis is None else axis
-        vertical = estimate_up(some) if axis is None else given_up(some, axis)
+        if axis is None:
+            axis = splats.up
+        if axis is None:
+            vertical = estimate_up(some)
+        else:
+            vertical = given_up(some, axis)
         axes = _choose_axes(some, vertical.axis)
         points = turned(some.points, axes)
         box = quantiles(points, some.weights, _EXTENT).T
@@ -159,7 +163,11 @@ class Site:
         terrain = None
         if vertical.grounded:
             ground = facing(some, vertical.axis)
-            terrain = Terrain.of(points[ground], some.weights[ground], box)
+            terrain = Terrain.of(
+                points[ground],
+                some.weights[ground],
+                box,
+            )
         return cls(
             points=points,
             weights=some.weights,
@@ -167,7 +175,12 @@ class Site:
             body=2
             * float(missing.min()),  # a Gaussian is drawn as far as three standard deviations
             terrain=terrain,
-            grid=Grid.of(box[0] - margin, box[1] + margin, matter, axes),
+            grid=Grid.of(
+                box[0] - margin,
+                box[1] + margin,
+                matter,
+                axes,
+            ),
             axes=axes,
             origin=splats.offset + matter.origin,
             size=matter.size,
@@ -218,11 +231,17 @@ class Site:
             return points[:, 2] - self.ground(points)
         return np.full(len(points), np.inf)
 
-    def is_free(self, points: Float, cells: float, above: float = -np.inf) -> Mask:
+    def is_free(
+        self,
+        points: Float,
+        cells: float,
+        above: float = -np.inf,
+    ) -> Mask:
         """Return whether points are over `cells` cells from matter, `above` the ground and below a sky."""
         free = self.grid.distance(points) > cells * self.grid.cell
         free &= self.above_ground(points) > above
-        return free & (norms(points - self.centre) < _BELOW_SKY * self.horizon)
+        free &= norms(points - self.centre) < _BELOW_SKY * self.horizon
+        return free
 
     @cached_property
     def tallness(self) -> float:
@@ -253,30 +272,43 @@ class Site:
         just_within = met + 0.5 * self.grid.cell
         scales = self.grid.scale_at(places[at] + just_within[:, None] * ways[way])
         is_sharp = scales < _SHARP * met
-        sharp = np.bincount(at[is_sharp], minlength=len(places)) / _DIRECTIONS
         enclosed = np.bincount(at, minlength=len(places)) / _DIRECTIONS
-        places = places[(enclosed > _ENCLOSED) & (sharp > _MOSTLY * enclosed)]
-        places = places[np.argsort(-self.grid.distance(places), kind="stable")]
+        sharp = np.bincount(at[is_sharp], minlength=len(places)) / _DIRECTIONS
+        in_room = enclosed > _ENCLOSED
+        in_room &= sharp > _MOSTLY * enclosed
+        places = places[in_room]
+        clearance = self.grid.distance(places)
+        places = places[np.argsort(-clearance, kind="stable")]
         share = len(places) / _TRIES
-        most = 1.0 if self.vertical.grounded else _SHELL
-        return Inside(places, share, float(np.interp(share, _ROOM_SHARES, (0.0, most))))
+        most = _SHELL
+        if self.vertical.grounded:
+            most = 1.0
+        weight = np.interp(share, _ROOM_SHARES, (0.0, most))
+        return Inside(places, share, float(weight))
 
 
 def _choose_axes(some: Matter, axis: Float) -> Float:
     """Return rows: along the scene if it is long, otherwise along a coordinate axis; to its left; up."""
-    ahead = np.eye(3)[int(np.argmin(np.round(np.abs(axis), 3)))]
+    flattest = np.argmin(np.round(np.abs(axis), 3))
+    ahead = np.eye(3)[flattest]
     ahead = ahead - (ahead @ axis) * axis
     ahead /= np.linalg.norm(ahead)
     left = np.cross(axis, ahead)
     weights = some.weights / some.weights.sum()
-    flat = np.stack([along(some.points, ahead), along(some.points, left)], axis=1)
+    flat = np.stack(
+        [
+            along(some.points, ahead),
+            along(some.points, left),
+        ],
+        axis=1,
+    )
     flat -= (weights[:, None] * flat).sum(axis=0)
     variances, vectors = np.linalg.eigh(moments(flat, weights))
     if variances[1] > _LONG * variances[0]:
         longest = vectors[:, 1]
         # solvers return either direction
-        sign = np.copysign(1.0, longest[np.argmax(np.abs(longest))])
-        x, y = longest * sign
+        largest = longest[np.argmax(np.abs(longest))]
+        x, y = longest * np.copysign(1.0, largest)
         ahead = x * ahead + y * left
     return np.stack([ahead, np.cross(axis, ahead), axis])
 
@@ -301,13 +333,21 @@ class Terrain:
         shape = np.maximum(1, np.ceil(sides / block - 1e-9)).astype(int)
         place = np.floor((points[:, :2] - low) / block).astype(int)
         inside = ((place >= 0) & (place < shape)).all(axis=1)
-        block_of = np.where(inside, place[:, 0] * shape[1] + place[:, 1], -1)
+        block_of = np.where(
+            inside,
+            place[:, 0] * shape[1] + place[:, 1],
+            -1,
+        )
         heights = np.full(int(np.prod(shape)), np.nan)
         order = np.argsort(block_of, kind="stable")
         found, firsts = np.unique(block_of[order], return_index=True)
         for number, rows in zip(found, np.split(order, firsts[1:]), strict=False):
             if number >= 0:
-                heights[number] = quantile(points[rows, 2], weights[rows], _LOW)
+                heights[number] = quantile(
+                    points[rows, 2],
+                    weights[rows],
+                    _LOW,
+                )
         heights = _fill(heights.reshape(shape), box[0, 2])
         # A morphological opening removes bumps narrower than three blocks; then blocks are smoothed.
         lowest = _stack_neighbours(heights, np.inf).min(axis=0)
@@ -319,7 +359,8 @@ class Terrain:
     def height(self, points: Float) -> Float:
         """Return (M,) ground heights under points: bilinear within the map, constant beyond its edge."""
         top = np.array(self.heights.shape) - 1
-        place = np.clip((points[:, :2] - self.low) / self.block - 0.5, 0, top)
+        place = (points[:, :2] - self.low) / self.block - 0.5
+        place = np.clip(place, 0, top)
         base = np.floor(place).astype(int)
         share = place - base
         total = np.zeros(len(points))

@@ -81,7 +81,8 @@ def estimate_up(sample: Matter) -> Up:
     """
     shape = _find_shape(sample)
     if shape.is_flat:
-        axis = _mean_normal(sample, shape.thinnest, facing(sample, shape.thinnest))
+        axis = shape.thinnest
+        axis = _mean_normal(sample, axis, facing(sample, axis))
         return _choose_sign(sample, axis, True, "the scene is flat")
     few = sample.first(_SEARCHED)
     directions = np.concatenate([np.eye(3), fibonacci(600)[:300]])
@@ -89,25 +90,28 @@ def estimate_up(sample: Matter) -> Up:
     edges = np.array([layer.edge for layer in layers])
     shares = np.array([layer.share for layer in layers])
     favours = [_favour_habit(axis) for axis in directions]
-    axis = directions[int(np.argmax(edges * favours))]
+    axis = directions[np.argmax(edges * favours)]
     for _ in range(3):
-        heights = along(sample.points, axis)
-        inside = np.abs(heights - _find_layer(sample, axis).height) < 2 * _SLAB
-        axis = _mean_normal(sample, axis, inside & facing(sample, axis, _FACING))
+        heights = along(sample.points, axis) - _find_layer(sample, axis).height
+        ground = facing(sample, axis, _FACING)
+        ground &= np.abs(heights) < 2 * _SLAB
+        axis = _mean_normal(sample, axis, ground)
     if _find_layer(sample, axis).edge > _GROUND:
         return _choose_sign(sample, axis, True, "a ground plane")
-    axis = directions[int(np.argmax(shares))]
-    across = shares[np.abs(directions @ axis) < 0.5].max()
+    axis = directions[np.argmax(shares)]
+    is_across = np.abs(directions @ axis) < 0.5
+    strongest_across = shares[is_across].max()
     axis = _mean_normal(sample, axis, facing(sample, axis, _FACING))
-    if shares.max() > _LAYERED * across and _favour_habit(axis) > 1:
+    if shares.max() > _LAYERED * strongest_across and _favour_habit(axis) > 1:
         return _choose_sign(sample, axis, True, "its layers face that way")
-    if shape.longest is not None:
-        # long objects lean, files are upright
-        usual = np.eye(3)[int(np.argmax(np.abs(shape.longest)))]
-        is_usual = abs(shape.longest @ usual) > _UPRIGHT
-        axis = usual if is_usual else shape.longest
-        return _choose_sign(sample, axis, False, "no ground; the long axis")
-    return _choose_sign(sample, np.array([0.0, -1.0, 0.0]), False, "no ground; a guess")
+    axis = np.array([0.0, -1.0, 0.0])
+    if shape.longest is None:
+        return _choose_sign(sample, axis, False, "no ground; a guess")
+    # long objects lean, files are upright
+    axis = np.eye(3)[np.argmax(np.abs(shape.longest))]
+    if not abs(shape.longest @ axis) > _UPRIGHT:
+        axis = shape.longest
+    return _choose_sign(sample, axis, False, "no ground; the long axis")
 
 
 def facing(sample: Matter, axis: Float, least: float = _SLOPED) -> Mask:
@@ -163,15 +167,23 @@ def _find_layer(sample: Matter, axis: Float) -> _Layer:
     best = int(np.argmax(pairs))
     share = pairs[best] / total
     height = (low + best + 1) * _SLAB
-    above = sample.weights[heights - height > 2 * _SLAB].sum()
-    below = sample.weights[heights - height < -2 * _SLAB].sum()
-    both_sides = 2 * min(above, below) / max(above + below, 0.05 * total)
-    return _Layer(float(share), float(height), float(share * (1 - both_sides)))
+    distances = heights - height
+    above = sample.weights[distances > 2 * _SLAB].sum()
+    below = sample.weights[distances < -2 * _SLAB].sum()
+    both_sides = 2 * min(above, below)
+    both_sides /= max(above + below, 0.05 * total)
+    return _Layer(
+        share=float(share),
+        height=float(height),
+        edge=float(share * (1 - both_sides)),
+    )
 
 
 def _favour_habit(axis: Float) -> float:
     """Return a factor that favours y and z, the up axes of nearly every file, over other directions."""
-    return 1.2 if np.abs(axis[1:]).max() > _UPRIGHT else 1.0
+    if np.abs(axis[1:]).max() > _UPRIGHT:
+        return 1.2
+    return 1.0
 
 
 def _mean_normal(sample: Matter, axis: Float, rows: Mask) -> Float:
@@ -195,16 +207,26 @@ def _choose_sign(sample: Matter, axis: Float, grounded: bool, why: str) -> Up:
         lean = _measure_lowness(heights, sample.weights, low, high)
         side = "its heavier end is down"
     if abs(lean) > _UNSURE:
-        return Up(axis * np.copysign(1.0, lean), grounded, f"{why}, {side}")
-    largest = int(np.argmax(np.abs(axis)))
+        return Up(
+            axis * np.copysign(1.0, lean),
+            grounded,
+            f"{why}, {side}",
+        )
+    largest = np.argmax(np.abs(axis))
     sign = np.copysign(1.0, _USUAL_SIGNS[largest] * axis[largest])
     return Up(axis * sign, grounded, f"{why}, its sign by custom")
 
 
-def _measure_lowness(heights: Float, weights: Float, low: float, high: float) -> float:
+def _measure_lowness(
+    heights: Float,
+    weights: Float,
+    low: float,
+    high: float,
+) -> float:
     """Return how low the mean height lies from `high`, −1, to `low`, 1."""
     mean = (weights * heights).sum() / weights.sum()
-    return float(1 - 2 * (mean - low) / positive(high - low))
+    share = (mean - low) / positive(high - low)
+    return float(1 - 2 * share)
 
 
 def _measure_lean(sample: Matter, axis: Float, heights: Float) -> float:
@@ -218,10 +240,13 @@ def _measure_lean(sample: Matter, axis: Float, heights: Float) -> float:
     flat = facing(sample, axis, _FACING)
     faces = sample.faces[flat]
     if faces.sum() > 0:
-        low, high = quantile(heights[flat], faces, [0.05, 0.95])
-        layers = [faces[np.abs(heights[flat] - end) < 2 * _SLAB].sum() for end in (low, high)]
-        if high - low >= 6 * _SLAB and min(layers) > 0.25 * faces.sum():
-            between = (heights > low + 2 * _SLAB) & (heights < high - 2 * _SLAB)
+        flat_heights = heights[flat]
+        low, high = quantile(flat_heights, faces, [0.05, 0.95])
+        floor = faces[np.abs(flat_heights - low) < 2 * _SLAB].sum()
+        ceiling = faces[np.abs(flat_heights - high) < 2 * _SLAB].sum()
+        if high - low >= 6 * _SLAB and min(floor, ceiling) > 0.25 * faces.sum():
+            between = heights > low + 2 * _SLAB
+            between &= heights < high - 2 * _SLAB
             if not weights[between].sum() > 0:
                 return 0.0
             return _measure_lowness(heights[between], weights[between], low, high)
@@ -232,13 +257,16 @@ def _measure_lean(sample: Matter, axis: Float, heights: Float) -> float:
         ground = rows & flat
         if not ground.any():
             ground = rows
-        above[rows] = heights[rows] - quantile(heights[ground], weights[ground], 0.5)
-    return float((weights * above).sum() / positive((weights * np.abs(above)).sum()))
+        ground_height = quantile(heights[ground], weights[ground], 0.5)
+        above[rows] = heights[rows] - ground_height
+    moment = (weights * above).sum()
+    return float(moment / positive((weights * np.abs(above)).sum()))
 
 
 def _number_columns(points: Float, axis: Float) -> Values:
     """Return (M,) numbers of 6×6 columns along an axis that points lie in."""
-    first = np.cross(axis, np.eye(3)[int(np.argmin(np.abs(axis)))])
+    first = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
     first /= np.linalg.norm(first)
-    sides = [np.floor(3 + 3 * along(points, across)) for across in (first, np.cross(axis, first))]
-    return (6, 1) @ np.clip(sides, 0, 5)
+    second = np.cross(axis, first)
+    numbers = [np.floor(3 + 3 * along(points, side)) for side in (first, second)]
+    return (6, 1) @ np.clip(numbers, 0, 5)

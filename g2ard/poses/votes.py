@@ -98,7 +98,13 @@ class Votes:
     faces: Float
 
     @classmethod
-    def of(cls, points: Float, sizes: Float, opacities: Float, represents: float = 1.0) -> Votes:
+    def of(
+        cls,
+        points: Float,
+        sizes: Float,
+        opacities: Float,
+        represents: float = 1.0,
+    ) -> Votes:
         """Let the first `_VOTERS` rows vote, of which each row stands for some Gaussians."""
         count = len(points)
         points = points[:_VOTERS]
@@ -128,19 +134,19 @@ class Votes:
         which, far, turn, height = halton(0, _PLACES, 4, 0).T
         rows = (which * len(self.points)).astype(int)
         z = 2 * height - 1
-        ways = directions(turn, np.sqrt(1 - np.square(z)), z)  # even on the sphere
+        level = np.sqrt(1 - np.square(z))
+        ways = directions(turn, level, z)  # even on the sphere
         away = self.reach[rows] * far**_CLOSE
         places = self.points[rows] + away[:, None] * ways
         votes = self.at(places)
         best = places[votes >= votes.max() - _WINNING]
-        logs = np.array([self._log_distance(place) for place in best])
+        logs = []
+        for place in best:
+            distances = positive(norms(self.points - place))
+            logs.append((self.weights * np.log(distances)).sum())
         order = np.argsort(logs, kind="stable")
         central = max(1, round(_CENTRAL * len(best)))
         return middle(best[order[:central]])
-
-    def _log_distance(self, place: Float) -> float:
-        distances = positive(norms(self.points - place))
-        return float((self.weights * np.log(distances)).sum())
 
     @cached_property
     def distances(self) -> Float:
@@ -178,7 +184,7 @@ class Votes:
         largest = 0.0
         for gap in gaps:
             if gap < radius:
-                inside = float(self.weights[self.distances <= gap].sum())
+                inside = self.weights[self.distances <= gap].sum()
                 largest = max(largest, inside * self._closed(gap))
         return largest
 
@@ -210,11 +216,18 @@ class Votes:
     def _around(self, radius: float) -> Float:
         """Return places around what is within a radius, from which it fits the frame."""
         within = self.distances <= radius
-        away = _AWAY * float(quantile(self.distances[within], self.weights[within], _FITTING))
-        return self.centre + away * fibonacci(_EYES)
+        fitting = quantile(
+            self.distances[within],
+            self.weights[within],
+            _FITTING,
+        )
+        return self.centre + _AWAY * fitting * fibonacci(_EYES)
 
     def _lost_beyond(self, radius: float) -> float:
         """Return the share of the scene that lies beyond a radius and covers no pixel from around it."""
         beyond = self.distances > radius
-        lost = [self.weights[beyond & ~self._sees(eye)].sum() for eye in self._around(radius)]
+        lost = []
+        for eye in self._around(radius):
+            unseen = beyond & ~self._sees(eye)
+            lost.append(self.weights[unseen].sum())
         return float(np.mean(lost))

@@ -88,7 +88,11 @@ _FRAME = {True: 0.8, False: 0.5}
 _THINGS = 0.12
 """Share of the frame that stands on the ground for the full score of a walk outdoors."""
 
-_FULL = ((0.8, 0.3, 1.0), (0.7, 0.2, 0.8), (0.5, 0.1, 0.6))
+_FULL = (
+    (0.8, 0.3, 1.0),
+    (0.7, 0.2, 0.8),
+    (0.5, 0.1, 0.6),
+)
 """Shares of the image that the scene covers, and that detail covers, and the score of a pose that exceeds
 both."""
 
@@ -149,22 +153,33 @@ def plan_inside(survey: Survey, count: int) -> Poses:
     dropped.
     """
     places = survey.inside.places
-    wide = max(1, int(_WIDE * len(places)))
+    widest = max(1, int(_WIDE * len(places)))
     clear = _CLEAR_CELLS * survey.site.grid.cell
 
     def tried(start: int, stop: int) -> tuple[Poses, Float]:
         at, turn, pitch = halton(start, stop, 3, survey.seed + 1).T
         is_even = np.arange(start, stop) % 2 == 0
-        choices = np.where(is_even, wide, len(places))
+        choices = np.where(is_even, widest, len(places))
+        rows = (at * choices).astype(int)
         gazes = directions_at(turn, between(_ROOM_PITCHES, pitch))
-        poses = Poses(places[(at * choices).astype(int)], gazes)
+        poses = Poses(places[rows], gazes)
         seen = Rays(survey, poses)
-        return poses, np.minimum(seen.covered / _COVERED, seen.close / clear)
+        scores = np.minimum(
+            seen.covered / _COVERED,
+            seen.close / clear,
+        )
+        return poses, scores
 
     return gather(survey, count if len(places) else 0, tried)
 
 
-def plan_walk(survey: Survey, count: int, shift: int = 0, *, indoors: bool | None = None) -> Poses:
+def plan_walk(
+    survey: Survey,
+    count: int,
+    shift: int = 0,
+    *,
+    indoors: bool | None = None,
+) -> Poses:
     """Plan at most `count` poses at eye height in connected free space, gazing all around.
 
     Gazes into a near wall or leaves, or out of the scene, are dropped. `indoors`, places lie between walls;
@@ -172,27 +187,44 @@ def plan_walk(survey: Survey, count: int, shift: int = 0, *, indoors: bool | Non
     """
     site = survey.site
     room_like = is_room(survey)
-    indoors = room_like if indoors is None else indoors
-    tall = site.sides[2] if indoors else site.tallness
-    far = 0.4 * min(site.sides[:2]) if indoors else 0.6 * tall
+    if indoors is None:
+        indoors = room_like
+    if indoors:
+        tall = site.sides[2]
+        far = 0.4 * min(site.sides[:2])
+    else:
+        tall = site.tallness
+        far = 0.6 * tall
     room = max(2 * site.grid.cell, 0.06 * tall)
-    heights = _UNDER_A_DOME if indoors and not room_like else _EYES[indoors]
-    at = halton(0, int(np.clip(4 * count, *_TRIES)), 3, survey.seed + shift)
-    places = site.place_at(at, tall * between(heights, at[:, 2]))
+    if indoors and not room_like:
+        eyes = _UNDER_A_DOME
+    else:
+        eyes = _EYES[indoors]
+    tries = int(np.clip(4 * count, *_TRIES))
+    at = halton(0, tries, 3, survey.seed + shift)
+    places = site.place_at(at, tall * between(eyes, at[:, 2]))
     places = places[site.is_free(places, room / site.grid.cell)]
     if indoors:
-        places = places[closed(site, places, 64, -1.0, 0.5) > _WALLS]
+        walled = closed(site, places, 64, -1.0, 0.5)
+        places = places[walled > _WALLS]
     else:
-        places = places[closed(site, places, 32, 0.5, 1.0) < 1 - _SKY]
-        places = places[closed(site, places, 16, -1.0, -0.8) > _FLOOR]
+        covered = closed(site, places, 32, 0.5, 1.0)
+        places = places[covered < 1 - _SKY]
+        grounded = closed(site, places, 16, -1.0, -0.8)
+        places = places[grounded > _FLOOR]
     places = places[_find_connected(site, places)]
 
     def tried(start: int, stop: int) -> tuple[Poses, Float]:
         turn, pitch = halton(start, stop, 2, survey.seed + shift + 1).T
         gazes = directions_at(turn, np.radians(between(_WALK_PITCHES, pitch)))
-        poses = Poses(places[np.arange(start, stop) % len(places)], gazes)
+        rows = np.arange(start, stop) % len(places)
+        poses = Poses(places[rows], gazes)
         seen = Rays(survey, poses)
-        scores = [seen.covered / _FRAME[indoors], seen.close / (2 * room), seen.median / far]
+        scores = [
+            seen.covered / _FRAME[indoors],
+            seen.close / (2 * room),
+            seen.median / far,
+        ]
         if not indoors:
             scores.append(seen.standing / _THINGS)
         return poses, np.min(scores, axis=0)
@@ -200,9 +232,17 @@ def plan_walk(survey: Survey, count: int, shift: int = 0, *, indoors: bool | Non
     return gather(survey, count if len(places) else 0, tried)
 
 
-def closed(site: Site, points: Float, rays: int, low: float, high: float) -> Float:
+def closed(
+    site: Site,
+    points: Float,
+    rays: int,
+    low: float,
+    high: float,
+) -> Float:
     """Return (M,) shares of the directions between two heights on the sphere that meet matter."""
-    return np.isfinite(site.met(points, fibonacci(rays, low, high))).mean(axis=1)
+    directions = fibonacci(rays, low, high)
+    distances = site.met(points, directions)
+    return np.isfinite(distances).mean(axis=1)
 
 
 def _find_connected(site: Site, points: Float) -> Mask:
@@ -215,9 +255,9 @@ def _find_connected(site: Site, points: Float) -> Mask:
     stop = near.ravel()
     ways = points[stop] - points[start]
     lengths = np.linalg.norm(ways, axis=1)
-    units = ways / np.where(lengths > 0, lengths, 1.0)[:, None]
-    seen = site.grid.cast(points[start], units) >= lengths
-    label = joined(np.arange(count), start[seen], stop[seen])
+    ways /= np.where(lengths > 0, lengths, 1.0)[:, None]
+    in_sight = site.grid.cast(points[start], ways) >= lengths
+    label = joined(np.arange(count), start[in_sight], stop[in_sight])
     sizes = np.bincount(label, minlength=count)
     return sizes[label] >= max(2.0, _HALLS * count)
 
@@ -234,13 +274,15 @@ def plan_sharp(survey: Survey, count: int, also: Poses | None = None) -> Poses:
         points = between(site.box, np.stack(at, axis=1))
         gazes = directions_at(turn, np.radians(between(_SHARP_PITCHES, pitch)))
         poses = Poses(points, gazes).take(site.is_free(points, 3))
-        poses = poses.take(Rays(survey, poses).close > 4 * site.grid.cell)
+        close = Rays(survey, poses).close
+        poses = poses.take(close > 4 * site.grid.cell)
         if also is not None and not start:
             poses = Poses.joined([also, poses])
         covered, fine, _ = survey.glance.of(survey.cameras(poses))
         scores = np.zeros(len(poses))
         for least_covered, least_fine, score in _FULL:
-            exceeds = (covered > least_covered) & (fine > least_fine)
+            exceeds = covered > least_covered
+            exceeds &= fine > least_fine
             scores = np.maximum(scores, exceeds * score)
         return poses, scores
 
@@ -255,21 +297,29 @@ def plan_anywhere(survey: Survey, count: int) -> Poses:
     """
     site = survey.site
     glance = Glance(survey.splats, survey.represents, SIGHT_ROWS)
-    diagonal = site.diagonal
-    close = _CLOSE * diagonal * site.size
+    least, most = _DISTANCES
+    least_distance = site.diagonal * least
+    close = _CLOSE * site.diagonal * site.size
     points = site.localize(glance.points)
-    rows = np.flatnonzero(site.encloses(points) & (glance.opacities > _SOLID))
+    solid = site.encloses(points)
+    solid &= glance.opacities > _SOLID
+    rows = np.flatnonzero(solid)
 
     def tried(start: int, stop: int) -> tuple[Poses, Float]:
         which, far, turn, rise = halton(start, stop, 4, survey.seed + 5).T
         aims = rows[(which * len(rows)).astype(int)]
         gazes = -directions_at(turn, np.radians(between(_RISES, rise)))
-        distances = diagonal * _DISTANCES[0] * (_DISTANCES[1] / _DISTANCES[0]) ** far
+        distances = least_distance * (most / least) ** far
         poses = Poses(points[aims] - distances[:, None] * gazes, gazes)
-        free = site.grid.cast(poses.eyes, gazes) > distances - 2 * site.grid.cell
+        met = site.grid.cast(poses.eyes, gazes)
+        free = met > distances - 2 * site.grid.cell
         poses = poses.take(free)
-        clear = glance.clear(survey.cameras(poses), aims[free], close) >= _CLEAR
-        poses = poses.take(clear)
+        transmittances = glance.clear(
+            survey.cameras(poses),
+            aims[free],
+            close,
+        )
+        poses = poses.take(transmittances >= _CLEAR)
         murk = glance.murk(survey.cameras(poses), close)
         return poses, (murk <= _MURK).astype(float)
 
@@ -286,17 +336,26 @@ def reach_of(survey: Survey, poses: Poses) -> Reach:
         away = points - poses.eyes[i]
         x, y, z = (away @ frame.T).T
         length = norms(away)
-        rows = np.flatnonzero(survey.lens.holds(x, y, z) & (length < nearest))
+        nearer = survey.lens.holds(x, y, z)
+        nearer &= length < nearest
+        rows = np.flatnonzero(nearer)
         eyes = np.repeat(poses.eyes[i : i + 1], len(rows), axis=0)
         met = site.grid.cast(eyes, away[rows] / length[rows, None])
         rows = rows[met > length[rows] - 2 * site.grid.cell]
         best[rows] = i
         nearest[rows] = length[rows]
-    coarse = site.grid.scale_at(points) * survey.lens.focal < nearest
-    return Reach(best, nearest, (best >= 0) & coarse)
+    coarse = best >= 0
+    coarse &= site.grid.scale_at(points) * survey.lens.focal < nearest
+    return Reach(best, nearest, coarse)
 
 
-def plan_near(survey: Survey, poses: Poses, reach: Reach, count: int, shift: int = 0) -> Poses:
+def plan_near(
+    survey: Survey,
+    poses: Poses,
+    reach: Reach,
+    count: int,
+    shift: int = 0,
+) -> Poses:
     """Plan at most `count` poses between the given ones and points that they see.
 
     Each pose stands where its point has a standard deviation of 1.5 pixels, at 0.25–0.6 of the original
@@ -315,11 +374,20 @@ def plan_near(survey: Survey, poses: Poses, reach: Reach, count: int, shift: int
     eyes = points + share[:, None] * ways
     gazes = normalized(points - eyes)
     right, up = halton(0, len(rows), 2, survey.seed + shift + 3).T
-    gazes += _JITTER * np.stack([right - 0.5, up - 0.5, right - up], axis=1)
+    jitter = np.stack(
+        [
+            right - 0.5,
+            up - 0.5,
+            right - up,
+        ],
+        axis=1,
+    )
+    gazes += _JITTER * jitter
     gazes /= norms(gazes)[:, None]
-    near = Poses(eyes, gazes).take(site.is_free(eyes, 2, _LOWEST))
-    clear = Rays(survey, near).close > 2 * site.grid.cell
-    return near.take(clear).take(slice(count))
+    near = Poses(eyes, gazes)
+    near = near.take(site.is_free(eyes, 2, _LOWEST))
+    near = near.take(Rays(survey, near).close > 2 * site.grid.cell)
+    return near.take(slice(count))
 
 
 def framed(survey: Survey, poses: Poses, points: Float) -> Mask:
@@ -331,7 +399,12 @@ def framed(survey: Survey, poses: Poses, points: Float) -> Mask:
     return found
 
 
-def plan_beyond(survey: Survey, poses: Poses, points: Float, count: int) -> Poses:
+def plan_beyond(
+    survey: Survey,
+    poses: Poses,
+    points: Float,
+    count: int,
+) -> Poses:
     """Plan at most `count` poses at the given places that look at points beyond the near matter.
 
     Each looks at a point that none before has in its frame, from where near matter hides little of the view.
@@ -342,12 +415,14 @@ def plan_beyond(survey: Survey, poses: Poses, points: Float, count: int) -> Pose
     for aim, place in chances[:count]:
         if not len(missing):
             missing = points
-        places = (np.arange(_OUTLOOKS) + int(place * len(poses))) % len(poses)
+        first = int(place * len(poses))
+        places = (np.arange(_OUTLOOKS) + first) % len(poses)
         eyes = poses.eyes[places]
         target = missing[int(aim * len(missing))]
         ways = target - eyes
         tried = Poses(eyes, ways / norms(ways)[:, None])
-        freest = np.argsort(Rays(survey, tried).covered, kind="stable")[:1]
+        covered = Rays(survey, tried).covered
+        freest = np.argsort(covered, kind="stable")[:1]
         chosen = tried.take(freest)
         missing = missing[~framed(survey, chosen, missing)]
         found = Poses.joined([found, chosen])

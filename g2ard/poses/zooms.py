@@ -26,7 +26,11 @@ _SOLID = 0.3
 
 
 def zoomed(
-    scene: Splats, cameras: Cameras, *, represents: float = 1.0, share: float = 1.0
+    scene: Splats,
+    cameras: Cameras,
+    *,
+    represents: float = 1.0,
+    share: float = 1.0,
 ) -> Cameras:
     """Turn some of the views into zooms: half the share of the Gaussians in sight that they show small.
 
@@ -44,15 +48,16 @@ def zoomed(
     some = take_evenly(scene, _SAMPLE)
     some = some.take(some.opacities > _SOLID)
     points = some.positions
-    axes = np.sort(some.scales.astype(np.float64), axis=1)
-    sizes = np.sqrt(axes[:, 1] * axes[:, 2] / represents)
+    scales = np.sort(some.scales.astype(np.float64), axis=1)
+    sizes = np.sqrt(scales[:, 1] * scales[:, 2] / represents)
     small: list[Int] = []  # per view, the rows in sight below `_FINEST` pixels
     seen = 0
     for view in cameras:
         rows = np.flatnonzero(view.holds(points))
         depths = along(points[rows], view.viewmat[2, :3]) + view.viewmat[2, 3]
         focal = np.sqrt(view.K[0, 0] * view.K[1, 1])
-        small.append(rows[sizes[rows] * focal < _FINEST * depths])
+        is_small = sizes[rows] * focal < _FINEST * depths
+        small.append(rows[is_small])
         seen += len(rows)
     small_share = sum(map(len, small)) / (2 * max(1, seen))
     wanted = round(share * min(_MOST, small_share) * len(cameras))
@@ -62,7 +67,11 @@ def zoomed(
     for i in free[:wanted]:
         chance, *at = chances[i]
         row = small[i][int(chance * len(small[i]))]
-        views[i] = _place_window(views[i], points[row], np.array(at))
+        views[i] = _place_window(
+            views[i],
+            points[row],
+            np.array(at),
+        )
     return Cameras.of(views)
 
 
@@ -71,8 +80,14 @@ def _place_window(view: Camera, point: Float, at: Float) -> Camera:
     size = np.array([view.width, view.height], np.float64)
     x, y, z = view.K @ (view.viewmat[:3, :3] @ point + view.viewmat[:3, 3])
     pixel = _TIMES * np.array([x, y]) / z
-    corner = np.clip(pixel - at * size, 0, (_TIMES - 1) * size)
+    last_corner = (_TIMES - 1) * size
+    corner = np.clip(pixel - at * size, 0, last_corner)
     K = view.K.copy()
     K[:2] *= _TIMES
     K[:2, 2] -= corner
-    return replace(view, K=K, name=f"{view.name}_zoom", kind=ZOOM)
+    return replace(
+        view,
+        K=K,
+        name=f"{view.name}_zoom",
+        kind=ZOOM,
+    )
