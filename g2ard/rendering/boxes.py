@@ -49,7 +49,11 @@ class Canvas:
     def blank(cls, camera: Camera) -> Canvas:
         """Return a canvas of a view on which nothing is drawn."""
         size = camera.height, camera.width
-        return cls(camera, np.zeros((*size, 3), np.float32), np.ones(size, np.float32))
+        return cls(
+            camera,
+            np.zeros((*size, 3), np.float32),
+            np.ones(size, np.float32),
+        )
 
     def draw(self, renderer: Renderer, box: Float) -> None:
         """Draw a box of a scene behind what is drawn.
@@ -72,7 +76,8 @@ class Canvas:
     def finished(self, background: Sequence[float] = BLACK) -> Float32:
         """Return the (H, W, 4) image in front of a background, RGB in [0, 1], and its alpha."""
         left = np.abs(self.light)[..., None]
-        return np.dstack([self.color + left * np.asarray(background, np.float32), 1 - left])
+        behind = left * np.asarray(background, np.float32)
+        return np.dstack([self.color + behind, 1 - left])
 
 
 def front_to_back(tree: KdTree, position: Float) -> list[int]:
@@ -88,7 +93,10 @@ def _walk(tree: KdTree, position: Float, first: int) -> Iterator[int]:
     if not (tree.below and tree.above):
         yield first
         return
-    halves = [(tree.below, first), (tree.above, first + tree.below.leaves)]
+    halves = [
+        (tree.below, first),
+        (tree.above, first + tree.below.leaves),
+    ]
     if position[tree.axis] >= tree.at:
         halves.reverse()
     for half, number in halves:

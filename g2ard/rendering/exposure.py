@@ -50,10 +50,12 @@ class Exposure(Report):
         """Describe the exposures of the views that have a photo."""
         names = targets.cameras.names
         rows = [view for view in range(len(names)) if against_of(targets, view) == "photo"]
-        gain, offset = (
-            (float(x.min()), float(x.max())) for x in np.moveaxis(exposures[rows], 2, 0)
+        gains, offsets = np.moveaxis(exposures[rows], 2, 0)
+        return cls(
+            gain=(float(gains.min()), float(gains.max())),
+            offset=(float(offsets.min()), float(offsets.max())),
+            photos={names[row]: exposures[row].tolist() for row in rows},
         )
-        return cls(gain, offset, {names[row]: exposures[row].tolist() for row in rows})
 
     def __str__(self) -> str:
         (dark, bright), (low, high) = self.gain, self.offset
@@ -82,14 +84,16 @@ class Moments:
     def fit(self) -> Float:
         """Return (3, 2), gain and offset of each channel: photo ≈ gain·render + offset·alpha."""
         prior = np.diag(_PRIOR) * max(1, self.pixels)
-        found = np.linalg.solve(self.normal + prior, self.right[..., None])[..., 0] + [1.0, 0.0]
+        found = np.linalg.solve(self.normal + prior, self.right[..., None])[..., 0]
+        found += [1.0, 0.0]
         return np.maximum(found, [_LEAST_GAIN, -np.inf])
 
     def error(self, exposure: Float) -> float:
         """Return the squared error that (3, 2) gains and offsets leave."""
         change = exposure - [1.0, 0.0]
         squares = np.einsum("ci,cij,cj->c", change, self.normal, change)
-        return float((self.total - 2 * (change * self.right).sum(1) + squares).sum())
+        products = (change * self.right).sum(1)
+        return float((self.total - 2 * products + squares).sum())
 
 
 def _find_backdrop(alpha: Float32 | None, background: Background) -> Float32 | float:
@@ -100,7 +104,10 @@ def _find_backdrop(alpha: Float32 | None, background: Background) -> Float32 | f
 
 
 def _compare_moments(
-    image: Float32, targets: Targets, view: int, background: Background
+    image: Float32,
+    targets: Targets,
+    view: int,
+    background: Background,
 ) -> Moments:
     """Compare a render, not clipped, with a photo where neither too bright nor too dark to tell."""
     photo = targets[view]
@@ -112,15 +119,28 @@ def _compare_moments(
         counts *= mask[..., None]
     own = (image - beyond).astype(np.float64)
     missing = photo - beyond - own
-    cover = np.ones((1, 1, 1)) if alpha is None else alpha[..., None].astype(np.float64)
+    if alpha is None:
+        cover = np.ones((1, 1, 1))
+    else:
+        cover = alpha[..., None].astype(np.float64)
 
     def total(values: Float) -> Float:
         return (counts * values).sum((0, 1))
 
     mixed = total(own * cover)
-    normal = np.array([[total(own**2), mixed], [mixed, total(cover**2)]]).transpose(2, 0, 1)
+    normal = np.array(
+        [
+            [total(own**2), mixed],
+            [mixed, total(cover**2)],
+        ]
+    ).transpose(2, 0, 1)
     right = np.stack([total(own * missing), total(cover * missing)], 1)
-    return Moments(normal, right, total(missing**2), int(counts.sum(dtype=np.int64)) // 3)
+    return Moments(
+        normal,
+        right,
+        total(missing**2),
+        int(counts.sum(dtype=np.int64)) // 3,
+    )
 
 
 def rendered(renderer: Renderer, targets: Targets, view: int) -> Float32:
@@ -130,7 +150,8 @@ def rendered(renderer: Renderer, targets: Targets, view: int) -> Float32:
         return renderer.clipped(targets.cameras[view])
     image = renderer.image(targets.cameras[view])
     background = renderer.background
-    gain, offset = _compare_moments(image, targets, view, background).fit().T.astype(np.float32)
+    exposure = _compare_moments(image, targets, view, background).fit()
+    gain, offset = exposure.T.astype(np.float32)
     alpha = alpha_of(targets, view)
     beyond = _find_backdrop(alpha, background)
     cover = np.float32(1) if alpha is None else alpha[..., None]
@@ -138,7 +159,10 @@ def rendered(renderer: Renderer, targets: Targets, view: int) -> Float32:
 
 
 def unexposed(
-    targets: Targets, view: int, exposure: Float, background: Background
+    targets: Targets,
+    view: int,
+    exposure: Float,
+    background: Background,
 ) -> tuple[Float32, Mask | None]:
     """Return a photo as the mean exposure would have made it, and its mask.
 
@@ -154,7 +178,10 @@ def unexposed(
     if alpha is not None:
         lost &= alpha > 0
     if lost.any():
-        mask = ~lost if mask is None else mask & ~lost
+        if mask is None:
+            mask = ~lost
+        else:
+            mask = mask & ~lost
     made = np.ascontiguousarray((photo - beyond - offset * cover) / gain + beyond, np.float32)
     if mask is not None:
         made[~mask] = 0
@@ -162,7 +189,11 @@ def unexposed(
 
 
 def exposures_of(
-    splats: Splats, targets: Targets, background: Background, *, decided: bool = False
+    splats: Splats,
+    targets: Targets,
+    background: Background,
+    *,
+    decided: bool = False,
 ) -> Float | None:
     """Estimate the exposures of photos against a scene: (C, 3, 2), gain and offset by view and channel.
 
@@ -173,13 +204,15 @@ def exposures_of(
     Returns None if exposures explain too little of the error beyond what one exposure of all explains, unless
     `decided`.
     """
-    photos = [view for view in range(len(targets.cameras)) if against_of(targets, view) == "photo"]
+    count = len(targets.cameras)
+    photos = [view for view in range(count) if against_of(targets, view) == "photo"]
     if len(photos) < 2:
         return None
     renderer = Renderer(splats.with_sh_degree(0), background=background)
 
     def moments(view: int) -> Moments:
-        return _compare_moments(renderer.image(targets.cameras[view]), targets, view, background)
+        image = renderer.image(targets.cameras[view])
+        return _compare_moments(image, targets, view, background)
 
     if not decided:
         some = [photos[i] for i in evenly_spaced(len(photos), _COMPARED_VIEWS)]
@@ -188,26 +221,33 @@ def exposures_of(
         common = _find_common(fits)
         before = sum(each.error(common) for each in compared)
         after = sum(each.error(fit) for each, fit in zip(compared, fits, strict=True))
-        grey = _relate(fits, list(range(len(fits))), len(fits)) @ [0.5, 1.0]
+        if after >= (1 - _EXPLAINED_SHARE) * before:
+            return None
+        relative = _relate(fits, list(range(len(fits))), len(fits))
+        grey = relative @ [0.5, 1.0]
         stops = np.log2(np.maximum(grey, 1e-3) / 0.5)
-        if after >= (1 - _EXPLAINED_SHARE) * before or np.sqrt((stops**2).mean()) < _LEAST_STOPS:
+        if np.sqrt((stops**2).mean()) < _LEAST_STOPS:
             return None
         if len(some) == len(photos):
-            return _relate(fits, photos, len(targets.cameras))
+            return _relate(fits, photos, count)
     fits = np.array([each.fit() for each in in_threads(moments, photos)])
-    return _relate(fits, photos, len(targets.cameras))
+    return _relate(fits, photos, count)
 
 
 def _find_common(fits: Float) -> Float:
     """Return the (3, 2) exposure that all have in common."""
-    gain = np.exp(np.log(fits[..., 0]).mean(0))
-    return np.stack([gain, gain * fits[..., 1].mean(0) / fits[..., 0].mean(0)], 1)
+    gains = fits[..., 0]
+    offsets = fits[..., 1]
+    gain = np.exp(np.log(gains).mean(0))
+    offset = gain * offsets.mean(0) / gains.mean(0)
+    return np.stack([gain, offset], 1)
 
 
 def _relate(fits: Float, rows: list[int], count: int) -> Float:
     """Return the exposures of all views relative to what those of photos have in common."""
     gain, offset = _find_common(fits).T
     made = np.tile([1.0, 0.0], (count, 3, 1))
-    made[rows, :, 0] = fits[..., 0] / gain
-    made[rows, :, 1] = fits[..., 1] - made[rows, :, 0] * offset
+    gains = fits[..., 0] / gain
+    made[rows, :, 0] = gains
+    made[rows, :, 1] = fits[..., 1] - gains * offset
     return made

@@ -31,7 +31,8 @@ def psnr(image: _Image, target: _Image, mask: Mask | None = None) -> float:
     if mask is not None:
         image = image[mask][:, None]
         target = target[mask][:, None]
-    return float(np.minimum(100.0, _core.psnr(_as_float32(image), _as_float32(target))))
+    found = _core.psnr(_as_float32(image), _as_float32(target))
+    return float(np.minimum(100.0, found))
 
 
 def edge_psnr(image: _Image, target: _Image, mask: Mask | None = None) -> float:
@@ -47,10 +48,15 @@ def edge_psnr(image: _Image, target: _Image, mask: Mask | None = None) -> float:
     >>> edge_psnr(flat, shifted), round(edge_psnr(flat, line), 2)
     (100.0, 18.75)
     """
-    count, error, *_ = _core.steps(_as_float32(image), _as_float32(target), _counts(mask))
+    count, error, *_ = _core.steps(
+        _as_float32(image),
+        _as_float32(target),
+        _counts(mask),
+    )
     if error == 0 or not count:
         return 100.0
-    return float(np.minimum(100.0, -10 * np.log10(error / count)))
+    psnr = -10 * np.log10(error / count)
+    return float(np.minimum(100.0, psnr))
 
 
 def detail(image: _Image, target: _Image, mask: Mask | None = None) -> float:
@@ -70,10 +76,13 @@ def detail(image: _Image, target: _Image, mask: Mask | None = None) -> float:
     1.0
     """
     count, _, own, wanted, common = _core.steps(
-        _as_float32(image), _as_float32(target), _counts(mask)
+        _as_float32(image),
+        _as_float32(target),
+        _counts(mask),
     )
     least = max(1, count) * _INVISIBLE**2
-    return float((common + least) / np.sqrt((own + least) * (wanted + least)))
+    energy = (own + least) * (wanted + least)
+    return float((common + least) / np.sqrt(energy))
 
 
 _INVISIBLE = 1e-4
@@ -94,13 +103,18 @@ def lost_detail(image: _Image, target: _Image, mask: Mask | None = None) -> floa
     >>> lost_detail(stripes, stripes), lost_detail(stripes, flat), lost_detail(flat, stripes) > 1
     (0.0, 0.0, True)
     """
-    wanted, common = _core.contrasts(_as_float32(image), _as_float32(target), _counts(mask)).T
+    wanted, common = _core.contrasts(
+        _as_float32(image),
+        _as_float32(target),
+        _counts(mask),
+    ).T
     contrast = np.sqrt(wanted)
     visible = contrast > _SEEN_CONTRAST
     if not visible.any():
         return 0.0
     contrast = contrast[visible]
-    lost = np.maximum((wanted - common)[visible] / contrast, 0)
+    lost = (wanted - common)[visible] / contrast
+    lost = np.maximum(lost, 0)
     noticed = _SEEN_CONTRAST * (contrast / _SEEN_CONTRAST) ** _MASKING
     return float(np.quantile(lost / noticed, 0.99))
 
@@ -135,7 +149,9 @@ def _as_float32(image: _Image) -> Float32:
 
 
 def _counts(mask: Mask | None) -> Mask | None:
-    return None if mask is None else np.ascontiguousarray(mask)
+    if mask is None:
+        return None
+    return np.ascontiguousarray(mask)
 
 
 class Metric(NamedTuple):
@@ -232,7 +248,8 @@ class Lpips:
         from torch.nn import functional
 
         x = torch.from_numpy(np.ascontiguousarray(image.transpose(2, 0, 1)))[None]
-        x = 2 * x - 1 if self.scaled else x
+        if self.scaled:
+            x = 2 * x - 1
         mean, std = (torch.tensor(v).reshape(1, 3, 1, 1) for v in (_MEAN, _STD))
         x = (x - mean) / std
         taps = []

@@ -26,7 +26,12 @@ _FLOOR = 0.05
 _DARKNESS = (0.0, 0.0, 0.0)
 
 
-def recoloured(dense: Splats, small: Splats, views: Cameras, progress: Progress = silent) -> Splats:
+def recoloured(
+    dense: Splats,
+    small: Splats,
+    views: Cameras,
+    progress: Progress = silent,
+) -> Splats:
     """Shift the colours of a simplified scene towards those that the dense scene shows in its place.
 
     With t, A the dense scene's image and opacity, i, B those of the simplified one and w = αT a Gaussian's
@@ -76,7 +81,8 @@ def shifted(
 
     def sums(view: int) -> Float:
         image, alpha = shown(view)
-        rasterizer, camera = _core.Rasterizer(), view_of(cameras, view, settings)
+        rasterizer = _core.Rasterizer()
+        camera = view_of(cameras, view, settings)
         own_image, opacity, *_ = _draw(rasterizer, arrays, camera, settings)
         alpha = alpha[..., None]
         own_alpha = opacity[..., None]
@@ -93,5 +99,10 @@ def shifted(
     return replace(small, sh0=(small.sh0 + shift / SH_C0).astype(np.float32))
 
 
-def _draw(rasterizer: _core.Rasterizer, arrays: Any, camera: View, settings: RasterSettings) -> Any:
+def _draw(
+    rasterizer: _core.Rasterizer,
+    arrays: Any,
+    camera: View,
+    settings: RasterSettings,
+) -> Any:
     return rasterizer.forward(arrays, camera, settings, list(_DARKNESS))

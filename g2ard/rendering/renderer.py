@@ -18,7 +18,7 @@ from g2ard.errors import InputError, require
 from g2ard.io import read_splats
 from g2ard.io.images import png_bytes, resize, to_bytes
 from g2ard.scene.cameras import Camera, Cameras
-from g2ard.scene.lenses import FACES, panorama_rays, photo_of
+from g2ard.scene.lenses import FACES, panorama_rays, photo_of, pinhole_matrix
 from g2ard.scene.prepared import DRAWN_LOG_SCALES, DRAWN_LOGITS, MAX_OPACITY
 from g2ard.scene.splats import HasSplats, Splats, scene_of, unit_quats
 
@@ -83,17 +83,20 @@ def settings_for(
         settings = replace(settings, antialiased=antialiased)
     if settings.near is not None or not len(means):
         return settings
-    sample = means[:: -(-len(means) // _NEAR_SAMPLE)].astype(np.float64)
-    radius = float(np.median(np.linalg.norm(sample - np.median(sample, axis=0), axis=1)))
-    return replace(settings, near=settings.near_of(0) * min(1.0, 2 * radius or 1.0))
+    stride = -(-len(means) // _NEAR_SAMPLE)
+    sample = means[::stride].astype(np.float64)
+    sample -= np.median(sample, axis=0)
+    radius = float(np.median(np.linalg.norm(sample, axis=1)))
+    near = settings.near_of(0) * min(1.0, 2 * radius or 1.0)
+    return replace(settings, near=near)
 
 
 def view_of(cameras: Cameras, index: int, settings: RasterSettings) -> View:
     """Convert one camera to the form that `_core` takes."""
-    K = cameras.Ks[index]
+    (fx, _, cx), (_, fy, cy), _ = cameras.Ks[index].tolist()
     return (
         cameras.viewmats[index].tolist(),
-        [float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])],
+        [fx, fy, cx, cy],
         (int(cameras.widths[index]), int(cameras.heights[index])),
         settings.near_of(index),
     )
@@ -114,7 +117,14 @@ def arrays_of(splats: Splats) -> tuple[Float32, Float32, Float32, Float32, Float
     with np.errstate(divide="ignore"):
         log_scales = np.clip(splats.log_scales, *DRAWN_LOG_SCALES)
     logits = np.clip(splats.logit_opacities, *DRAWN_LOGITS)
-    arrays = (splats.means, unit_quats(splats.quats), log_scales, logits, splats.sh0, splats.shN)
+    arrays = (
+        splats.means,
+        unit_quats(splats.quats),
+        log_scales,
+        logits,
+        splats.sh0,
+        splats.shN,
+    )
     a, b, c, d, e, f = (np.ascontiguousarray(array, dtype=np.float32) for array in arrays)
     return a, b, c, d, e, f
 
@@ -317,7 +327,10 @@ def render(
     >>> out.image.shape, bool(out.alpha[12, 16] > 0.9), out.image[0, 0].tolist()
     ((24, 32, 3), True, [1.0, 1.0, 1.0])
     """
-    scene = read_splats(splats) if isinstance(splats, str | Path) else scene_of(splats)
+    if isinstance(splats, str | Path):
+        scene = read_splats(splats)
+    else:
+        scene = scene_of(splats)
     return Renderer(scene, background=background, settings=settings).render(camera, median=median)
 
 
@@ -344,10 +357,12 @@ def stations(cameras: Cameras) -> Cameras:
         if view.lens is None:
             found[view.name] = view
             continue
-        viewmat = np.eye(4)
-        viewmat[:3] = np.array(view.lens.turn).reshape(3, 3) @ view.viewmat[:3]
         name = photo_of(view.name)
-        found.setdefault(name, Camera(viewmat, view.K, view.width, view.height, name))
+        if name not in found:
+            turn = np.array(view.lens.turn).reshape(3, 3)
+            viewmat = np.eye(4)
+            viewmat[:3] = turn @ view.viewmat[:3]
+            found[name] = Camera(viewmat, view.K, view.width, view.height, name)
     return Cameras.of(found.values())
 
 
@@ -366,15 +381,19 @@ def panorama(
     """
     half = _FINER * width / (2 * np.pi)  # as many pixels per radian in the middle of a face
     side = 2 * (int(np.ceil(half)) + _MARGIN)
-    K = np.array([[half, 0, side / 2], [0, half, side / 2], [0, 0, 1]])
+    middle = side / 2
+    K = pinhole_matrix(half, half, middle, middle)
     v, u = np.mgrid[0:side, 0:side] + 0.5
-    reach = np.sqrt(((u - side / 2) ** 2 + (v - side / 2) ** 2) / half**2 + 1).astype(np.float32)
+    squares = (u - middle) ** 2 + (v - middle) ** 2
+    reach = np.sqrt(squares / half**2 + 1).astype(np.float32)
+    del v, u, squares
     pictures = []
     for turn in FACES.values():
         viewmat = np.eye(4)
         viewmat[:3] = turn.T @ camera.viewmat[:3]
         image, alpha, depth = shown(Camera(viewmat, K, side, side))
-        pictures.append(np.dstack([image, alpha, depth * reach]).reshape(side * side, 5))
+        planes = np.dstack([image, alpha, depth * reach])
+        pictures.append(planes.reshape(side * side, 5))
     height = width // 2
     out = np.empty((height, width, 5), np.float32)
     for top in range(0, height, _BAND):
@@ -387,19 +406,30 @@ def panorama(
         for number, picture in enumerate(pictures):
             here = np.flatnonzero(face == number)
             x, y, z = local[number, here].T
-            fine[here] = _sample(picture, side, half * x / z + side / 2, half * y / z + side / 2)
-        fine_rows = fine.reshape(rows.stop - rows.start, _FINER * width, 5)
+            fine[here] = _sample(
+                picture,
+                side,
+                half * x / z + middle,
+                half * y / z + middle,
+            )
+        fine_rows = fine.reshape(-1, _FINER * width, 5)
         out[top:bottom] = resize(fine_rows, (width, bottom - top))
-    return np.ascontiguousarray(out[..., :3]), out[..., 3].copy(), out[..., 4].copy()
+    image = np.ascontiguousarray(out[..., :3])
+    return image, out[..., 3].copy(), out[..., 4].copy()
 
 
 def _sample(picture: Float32, side: int, u: Float, v: Float) -> Float32:
     """Sample a square picture, (side², C), bilinearly at pixels u, v."""
-    left = np.floor(u - 0.5).astype(int)
-    above = np.floor(v - 0.5).astype(int)
-    right = (u - 0.5 - left)[:, None].astype(np.float32)
-    down = (v - 0.5 - above)[:, None].astype(np.float32)
+    u = u - 0.5
+    v = v - 0.5
+    left = np.floor(u).astype(int)
+    above = np.floor(v).astype(int)
+    right = (u - left)[:, None].astype(np.float32)
+    down = (v - above)[:, None].astype(np.float32)
     at = above * side + left
-    top = picture[at] * (1 - right) + picture[at + 1] * right
-    bottom = picture[at + side] * (1 - right) + picture[at + side + 1] * right
+    top = picture[at] * (1 - right)
+    top += picture[at + 1] * right
+    at += side
+    bottom = picture[at] * (1 - right)
+    bottom += picture[at + 1] * right
     return top * (1 - down) + bottom * down

@@ -26,7 +26,8 @@ def over_sky(image: Float32, light: Float32) -> Float32:
     """
     down = np.linspace(0, 1, len(image), dtype=np.float32)[:, None, None]
     top, bottom = (np.array(color, np.float32) / 255 for color in (TOP, BOTTOM))
-    return np.asarray(image + light[..., None] * (top + down * (bottom - top)), np.float32)
+    sky = top + down * (bottom - top)
+    return np.asarray(image + light[..., None] * sky, np.float32)
 
 
 def seen_on_sky(drawn: Rendered) -> Float32:

@@ -87,8 +87,13 @@ def scored_in(targets: Targets, split: str = "") -> str:
     """
     count = len(targets.cameras)
     kinds = kinds_of(targets)
-    name = f"{split} {'photo' if kinds == 'photos' else 'view'}".strip()
-    against = "" if kinds == "photos" else f" against {kinds}"
+    if kinds == "photos":
+        noun = "photo"
+        against = ""
+    else:
+        noun = "view"
+        against = f" against {kinds}"
+    name = f"{split} {noun}".strip()
     exposed = ", exposure fitted" * isinstance(targets, Exposed)
     return f"{plural(count, name)}{against}, {targets.cameras.size_text}{exposed}"
 
@@ -131,7 +136,10 @@ def checked_targets(targets: Targets, parameter: str = "targets") -> Targets:
 
 
 def as_image(
-    image: Any, cameras: Cameras, view: int, parameter: str
+    image: Any,
+    cameras: Cameras,
+    view: int,
+    parameter: str,
 ) -> NDArray[np.uint8 | np.float32]:
     """Return an image of a view, (H, W, 3) or (H, W, 4) in uint8 or float32, without a copy if possible.
 
@@ -148,7 +156,10 @@ def as_image(
     height = int(cameras.heights[view])
     width = int(cameras.widths[view])
     hint = None
-    if array.shape not in ((height, width, 3), (height, width, 4)):
+    if array.shape not in (
+        (height, width, 3),
+        (height, width, 4),
+    ):
         wrong = f"expected shape ({height}, {width}, 3), got {array.shape}"
         if array.shape[1:] == (height, width):
             hint = "move the channels to the end"
@@ -221,11 +232,14 @@ class _Chosen(_Sourced):
 
     def _parts(self, views: Sequence[int] | None = None) -> list[tuple[Targets, list[int]]]:
         """Return the other targets and the rows in them of some views, of all by default."""
+        if views is None:
+            places = self._places
+        else:
+            places = [self._places[view] for view in views]
         parts: dict[int, tuple[Targets, list[int]]] = {}
-        for targets, row in (
-            self._places if views is None else [self._places[view] for view in views]
-        ):
-            parts.setdefault(id(targets), (targets, []))[1].append(row)
+        for targets, row in places:
+            _, rows = parts.setdefault(id(targets), (targets, []))
+            rows.append(row)
         return list(parts.values())
 
     def fill(self, progress: Progress, views: Sequence[int] | None = None) -> None:
@@ -255,7 +269,10 @@ class Subset(_Chosen):
 
     def __init__(self, targets: Targets, rows: ArrayLike) -> None:
         rows = np.asarray(rows, np.int64)
-        super().__init__(targets.cameras.take(rows), [(targets, int(row)) for row in rows])
+        super().__init__(
+            targets.cameras.take(rows),
+            [(targets, int(row)) for row in rows],
+        )
 
 
 class Exposed(Subset):
@@ -289,7 +306,10 @@ class _Converted(_Chosen):
 
 def _as_floats(image: Values) -> Float32:
     """Return an image as contiguous float32, divided by 255 if it has bytes."""
-    scaled = image.astype(np.float32) / np.float32(255) if image.dtype == np.uint8 else image
+    if image.dtype == np.uint8:
+        scaled = image.astype(np.float32) / np.float32(255)
+    else:
+        scaled = image
     return np.ascontiguousarray(scaled, np.float32)
 
 
@@ -299,11 +319,14 @@ def with_pixels(targets: Targets) -> Targets:
     Raises:
         InputError: none is left.
     """
-    masks = ((view, mask_of(targets, view)) for view in range(len(targets.cameras)))
+    count = len(targets.cameras)
+    masks = ((view, mask_of(targets, view)) for view in range(count))
     rows = [view for view, mask in masks if mask is None or mask.any()]
     if not rows:
-        raise InputError(f"the masks of {plural(len(targets.cameras), 'view')} leave no pixel")
-    return targets if len(rows) == len(targets.cameras) else Subset(targets, rows)
+        raise InputError(f"the masks of {plural(count, 'view')} leave no pixel")
+    if len(rows) == count:
+        return targets
+    return Subset(targets, rows)
 
 
 _KEEPING = threading.Lock()
@@ -351,7 +374,10 @@ class Cached(_Sourced, Shown):
         if key in self._spill:
             return self._spill.get(key)
         made = make(view)
-        size = 0 if made is None else made.nbytes
+        if made is None:
+            size = 0
+        else:
+            size = made.nbytes
         with _KEEPING:
             if key in self._kept:  # another thread was faster
                 return self._kept[key]
@@ -408,9 +434,12 @@ class Photos(Cached):
                     parameter="images",
                 )
             if all(isinstance(image, str | Path) for image in images):
-                own = zip(cameras.image_paths, cameras.mask_paths, images, strict=True)
-                masks = tuple(Path(new) if mask and mask == old else mask for old, mask, new in own)
-                cameras = replace(cameras, image_paths=tuple(map(Path, images)), mask_paths=masks)
+                paths = tuple(map(Path, images))
+                masks = list(cameras.mask_paths)
+                for view, mask in enumerate(masks):
+                    if mask and mask == cameras.image_paths[view]:  # it is in the photo's file
+                        masks[view] = paths[view]
+                cameras = replace(cameras, image_paths=paths, mask_paths=tuple(masks))
             else:
                 self._images = [
                     as_image(image, cameras, i, "images") for i, image in enumerate(images)
@@ -450,10 +479,13 @@ class Photos(Cached):
         return alpha
 
     def _alpha(self, view: int) -> Float32 | None:
-        own = (
-            load_photo(self.cameras, view, None)[0] if self._images is None else self._images[view]
-        )
-        return _as_floats(own)[..., 3].copy() if own.shape[2] == 4 else None
+        if self._images is None:
+            own = load_photo(self.cameras, view, None)[0]
+        else:
+            own = self._images[view]
+        if own.shape[2] != 4:
+            return None
+        return _as_floats(own)[..., 3].copy()
 
     def _stored(self, view: int) -> Values:
         if self._images is not None and self._images[view].shape[2] == 3:
@@ -482,8 +514,11 @@ class Photos(Cached):
 def _composite(image: Values, background: Colour) -> Float32:
     """Composite an image with alpha over the background."""
     floats = _as_floats(image)
+    alpha = floats[..., 3:]
     colour = np.array(background, np.float32)
-    return np.ascontiguousarray(floats[..., :3] * floats[..., 3:] + colour * (1 - floats[..., 3:]))
+    composited = floats[..., :3] * alpha
+    composited += colour * (1 - alpha)
+    return np.ascontiguousarray(composited)
 
 
 _RENDER_LEVELS = np.float32(65_535)
@@ -544,7 +579,8 @@ class TeacherRenders(Cached):
 
     def fill(self, progress: Progress, views: Sequence[int] | None = None) -> None:
         """Render the views, all by default, so that later steps take equal time; stop if the disk is full."""
-        views = range(len(self.cameras)) if views is None else views
+        if views is None:
+            views = range(len(self.cameras))
         missing = [view for view in views if not self._spill.full and not self._holds(view)]
         for number, _ in enumerate(in_threads(self._stored, missing), 1):
             progress("targets", number, len(missing))
@@ -604,10 +640,12 @@ class PhotosOrRenders(_Chosen):
         else:
             others = teacher(parts[1])
         rows = np.where(pictured, np.cumsum(pictured), np.cumsum(~pictured)) - 1
-        places = [
-            (photos if photo else others, int(row))
-            for photo, row in zip(pictured, rows, strict=True)
-        ]
+        places: list[tuple[Targets, int]] = []
+        for is_photo, row in zip(pictured, rows.tolist(), strict=True):
+            if is_photo:
+                places.append((photos, row))
+            else:
+                places.append((others, row))
         super().__init__(cameras, places)
 
 

@@ -142,18 +142,26 @@ def usual_and_others(cameras: Cameras) -> tuple[Cameras, Cameras]:
     every = np.arange(len(cameras))
     usual = np.array(rows_by_kind(cameras.kinds).get(USUAL, every))
     other = np.setdiff1d(every, usual)
-    return cameras.take(usual), cameras.take(other[evenly_spaced(len(other), _OTHER_VIEWS)])
+    some = evenly_spaced(len(other), _OTHER_VIEWS)
+    return cameras.take(usual), cameras.take(other[some])
 
 
 def weight_of_others(usual: int, others: int) -> float:
     """Return the weight of a view of another kind among some usual views."""
-    return _OTHER_SHARE * usual / others if others else 0.0
+    if not others:
+        return 0.0
+    return _OTHER_SHARE * usual / others
 
 
 class _Sampler:
     """Function of `visibility_source`: usual `views`, of which it renders the rounds `used`, and `others`."""
 
-    def __init__(self, cameras: Cameras, longest: int, progress: Progress) -> None:
+    def __init__(
+        self,
+        cameras: Cameras,
+        longest: int,
+        progress: Progress,
+    ) -> None:
         usual, others = usual_and_others(cameras)
         self.others = others.resized(longest)
         full = take_evenly(usual, MOST_VIEWS)
@@ -185,18 +193,31 @@ class _Sampler:
         if len(self.others):
             rendered = sum(map(len, self.used))
             sums = _core.VisibilityAccumulator(core)
-            self._add(sums, self.others.recentred(scene.offset), range(len(self.others)))
+            self._add(
+                sums,
+                self.others.recentred(scene.offset),
+                range(len(self.others)),
+            )
             weight += np.float32(weight_of_others(rendered, len(self.others))) * sums.by_row()[0]
         return SampledVisibility(weight, pixel_size * self.shrunk)
 
-    def _add(self, sums: _core.VisibilityAccumulator, cameras: Cameras, views: range) -> int:
+    def _add(
+        self,
+        sums: _core.VisibilityAccumulator,
+        cameras: Cameras,
+        views: range,
+    ) -> int:
         """Add a round of views; return the number of Gaussians seen so far."""
         made = [view_of(cameras, i, self.settings) for i in views]
         return sums.add(made, self.settings, counter(self.progress, "visibility"))
 
 
 def add_until_converged(
-    add: Callable[[range], int], count: int, rows: int, *, free: int = 0
+    add: Callable[[range], int],
+    count: int,
+    rows: int,
+    *,
+    free: int = 0,
 ) -> list[range]:
     """Add rounds of views until one finds few new Gaussians; return those that were added.
 
@@ -209,7 +230,8 @@ def add_until_converged(
     seen = 0
     for first in spread(apart):
         rounds.append(range(first, count, apart))
-        before, seen = seen, add(rounds[-1])
+        before = seen
+        seen = add(rounds[-1])
         converged = len(rounds) > 1 and seen - before < CONVERGED * rows
         if converged and len(rounds) * ROUND * rows >= free:
             break
