@@ -24,7 +24,7 @@ from g2ard.arrays import Float, Float32, Mask, Rows, Values
 from g2ard.errors import InputError, require
 from g2ard.progress import Progress, counter, silent
 from g2ard.rendering.renderer import Renderer
-from g2ard.scene.cameras import Camera, Cameras
+from g2ard.scene.cameras import Camera, Cameras, within_frame
 from g2ard.scene.reproducible import joined
 from g2ard.scene.shape import NEEDLE_LENGTH, longer_axes
 from g2ard.scene.splats import DRAWN_LOGIT, Splats
@@ -97,7 +97,8 @@ def find_clutter(
     Raises:
         InputError: an unknown kind, or `seen` or `unoccluded` of another length.
     """
-    if unknown := sorted(set(kinds) - set(KINDS)):
+    unknown = sorted(set(kinds) - set(KINDS))
+    if unknown:
         raise InputError(
             f"expected some of {', '.join(KINDS)}, got {unknown[0]!r}", parameter="kinds"
         )
@@ -161,7 +162,13 @@ def compare_depths(
     owners = np.arange(len(splats))
     if floating:
         long, mean_to_end = _find_elongated(splats, owners)
-        points = np.concatenate([points, points[long] - mean_to_end, points[long] + mean_to_end])
+        points = np.concatenate(
+            [
+                points,
+                points[long] - mean_to_end,
+                points[long] + mean_to_end,
+            ]
+        )
         owners = np.concatenate([owners, long, long])
     points += splats.offset
     unoccluded = np.zeros(count, bool)
@@ -184,7 +191,9 @@ def compare_depths(
             rays = points[rows] - camera.position
             rays /= np.linalg.norm(rays, axis=1, keepdims=True)
             owner = owners[rows]
-            along = np.einsum("nji,nj->ni", rotation_matrices(splats.quats[owner]), rays)
+            frames = rotation_matrices(splats.quats[owner])
+            along = np.einsum("nji,nj->ni", frames, rays)
+            del frames
             along = np.linalg.norm(along * splats.scales[owner], axis=1)
             floats[rows] += z + along < (1 - _SURFACE_SLACK) * surface
         progress("depths", done, len(cameras), {})
@@ -199,13 +208,16 @@ def compare_depths(
 def _find_in_frame(points: Float, camera: Camera, depths: Float32) -> tuple[Rows, Float, Float32]:
     """Return the rows of points in the frame, their depths, and the surface's depths at their pixels."""
     x, y, z = camera.viewmat[:3, :3] @ points.T + camera.viewmat[:3, 3:]
+    (fx, _, cx), (_, fy, cy), _ = camera.K
     with np.errstate(divide="ignore", invalid="ignore"):
-        u = np.floor(camera.K[0, 0] * x / z + camera.K[0, 2])
-        v = np.floor(camera.K[1, 1] * y / z + camera.K[1, 2])
-    inside = (z > 0) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
+        u = np.floor(fx * x / z + cx)
+        v = np.floor(fy * y / z + cy)
+    inside = within_frame(u, v, camera.width, camera.height)
+    inside &= z > 0
     rows = np.flatnonzero(inside)
-    surface = depths[v[rows].astype(int), u[rows].astype(int)]
-    return rows, z[rows], surface
+    row = v[rows].astype(int)
+    column = u[rows].astype(int)
+    return rows, z[rows], depths[row, column]
 
 
 def extent_of(splats: Splats) -> tuple[list[float], float]:
@@ -240,17 +252,25 @@ def _mark_needles(splats: Splats, rest: Mask, progress: Progress) -> Mask:
     if not len(long) or len(rows) <= 2 * _NEIGHBORS:
         return out
     means = splats.means.astype(np.float64)
-    ends = np.concatenate([means[long] - mean_to_end, means[long] + mean_to_end])
+    ends = np.concatenate(
+        [
+            means[long] - mean_to_end,
+            means[long] + mean_to_end,
+        ]
+    )
     points = np.concatenate([means[rows], ends])
     found = _core.knn(np.ascontiguousarray(points), _NEIGHBORS, counter(progress, "neighbours"))
     near = found[len(rows) :].astype(np.int64)  # of the ends
     is_mean = near < len(rows)
     other = rows[np.where(is_mean, near, 0)]
-    is_other = is_mean & (other != np.tile(long, 2)[:, None])
+    own = np.tile(long, 2)[:, None]
     away = np.linalg.norm(means[other] - ends[:, None], axis=2)
     reach = _FOOTPRINT_SIGMAS * splats.scales[other].max(axis=2)
-    covered = (is_other & (away <= reach)).any(axis=1)  # per end
-    out[long[~covered.reshape(2, -1).any(axis=0)]] = True
+    covers = is_mean & (other != own)
+    covers &= away <= reach
+    covered = covers.any(axis=1)  # per end
+    isolated = ~covered.reshape(2, -1).any(axis=0)
+    out[long[isolated]] = True
     return out
 
 
@@ -259,10 +279,10 @@ def _find_elongated(splats: Splats, rows: Rows) -> tuple[Rows, Float]:
     width, length = longer_axes(splats.scales[rows].astype(np.float64)).T
     long = rows[length > NEEDLE_LENGTH * np.maximum(width, 1e-30)]
     axis = np.argmax(splats.scales[long], axis=1)
-    along = np.take_along_axis(rotation_matrices(splats.quats[long]), axis[:, None, None], axis=2)[
-        :, :, 0
-    ]
-    return long, 2 * splats.scales[long, axis].astype(np.float64)[:, None] * along
+    frames = rotation_matrices(splats.quats[long])
+    longest = np.take_along_axis(frames, axis[:, None, None], axis=2)[:, :, 0]
+    sigmas = splats.scales[long, axis].astype(np.float64)
+    return long, 2 * sigmas[:, None] * longest
 
 
 def _mark_floaters(
@@ -285,13 +305,16 @@ def _mark_floaters(
         progress("groups", first, len(rows))
         block = slice(first, first + _BLOCK)
         other = near[block]
-        away = np.sqrt(sum((axis[other] - axis[block, None]) ** 2 for axis in means.T))
-        a, b = np.nonzero(away <= reach[block, None] + reach[other])
+        squares = sum((axis[other] - axis[block, None]) ** 2 for axis in means.T)
+        touching = np.sqrt(squares) <= reach[block, None] + reach[other]
+        a, b = np.nonzero(touching)
         group = joined(group, a + first, other[a, b])
     progress("groups", len(rows), len(rows))
     count = np.bincount(group, minlength=len(rows))
     light = np.bincount(group, weight[rows], minlength=len(rows))
-    small = (count <= _FLOATER_SHARE * len(rows)) & (light <= _FLOATER_SHARE * light.sum())
-    small &= np.bincount(group, unoccluded[rows], minlength=len(rows)) > 0
+    shown = np.bincount(group, unoccluded[rows], minlength=len(rows))
+    small = count <= _FLOATER_SHARE * len(rows)
+    small &= light <= _FLOATER_SHARE * light.sum()
+    small &= shown > 0
     out[rows[small[group]]] = True
     return out

@@ -51,7 +51,10 @@ class Scores(Report):
         cls, scores: Sequence[Scores], average: Callable[[Any], Any] = np.mean, **further: Any
     ) -> Self:
         """Return the means of several scores, with further fields."""
-        means = {name: float(average([getattr(each, name) for each in scores])) for name in METRICS}
+        means = {}
+        for name in METRICS:
+            values = [getattr(each, name) for each in scores]
+            means[name] = float(average(values))
         return cls(**means, **further)
 
 
@@ -119,18 +122,21 @@ class Evaluation(Means):
 
     def as_dict(self) -> dict[str, Any]:
         """Return the content of `g2ard evaluate --json`."""
+        views = []
+        for view in self.views:
+            entry = {"name": view.name, "size": list(view.size), **view.scores, "lost": view.lost}
+            if view.against:
+                entry["against"] = view.against
+            if view.kind != USUAL:
+                entry["kind"] = view.kind
+            views.append(entry)
         return {
             "count": self.count,
             "bytes": self.bytes,
             **self.scores,
             "lpips": self.lpips or None,
             "scored_in": self.scored_in,
-            "views": [
-                {"name": v.name, "size": list(v.size), **v.scores, "lost": v.lost}
-                | ({"against": v.against} if v.against else {})
-                | ({"kind": v.kind} if v.kind != USUAL else {})
-                for v in self.views
-            ],
+            "views": views,
         }
 
 
@@ -195,7 +201,8 @@ def evaluate(
         image = rendered(renderer, targets, view)
         target = targets[view]
         if eight_bit:
-            image, target = as_saved(image), as_saved(target)
+            image = as_saved(image)
+            target = as_saved(target)
         perceived = {net: model(image, target) for net, model in (lpips or {}).items()}
         mask = mask_of(targets, view)
         if mask is not None and not mask.any():

@@ -100,7 +100,9 @@ def lift(
 
 def in_axes(splats: Splats, axes: Axes) -> Splats:
     """Return a scene whose coordinates are stated to have these axes."""
-    return splats if axes == "RDF" else replace(splats, axes=axes)
+    if axes == "RDF":
+        return splats
+    return replace(splats, axes=axes)
 
 
 def guessed_axes(positions: Float, progress: Progress = silent) -> Axes:

@@ -16,7 +16,7 @@ from g2ard.io.sanitize import Tally
 from g2ard.io.stream import MarkedPoints, PointStream, RawPoints
 from g2ard.io.types import Cloud, Note, Notes, Points
 from g2ard.progress import Progress, Say, plural, silent
-from g2ard.scene.cameras import Cameras
+from g2ard.scene.cameras import Cameras, within_frame
 from g2ard.system.cached import cached_property
 from g2ard.system.keys import key_of
 
@@ -34,7 +34,12 @@ _UNCOLORED_NOTES = ("grey", "black", "black_points")
 
 
 def colored(
-    cloud: Cloud, train: Cameras, name: str, *, progress: Progress = silent, say: Say
+    cloud: Cloud,
+    train: Cameras,
+    name: str,
+    *,
+    progress: Progress = silent,
+    say: Say,
 ) -> Points:
     """Return a cloud's points, those without a colour with that of training photos, where any sees them."""
     points = cloud.points
@@ -60,7 +65,13 @@ class ColoredStream(PointStream):
         planned: leave points as they are, in a dry run.
     """
 
-    def __init__(self, stream: PointStream, cameras: Cameras, *, planned: bool = False) -> None:
+    def __init__(
+        self,
+        stream: PointStream,
+        cameras: Cameras,
+        *,
+        planned: bool = False,
+    ) -> None:
         vars(self).update(vars(stream))  # the same cloud
         pictured = [row for row, path in enumerate(cameras.image_paths) if path is not None]
         self._bare = stream
@@ -85,12 +96,13 @@ class ColoredStream(PointStream):
         return super().__getstate__()
 
     def identity(self) -> list[Any]:
-        photos = [
-            path
-            for path in (*self._photos.image_paths, *self._photos.mask_paths)
-            if path is not None
+        paths = (*self._photos.image_paths, *self._photos.mask_paths)
+        photos = [path for path in paths if path is not None]
+        return [
+            self._bare.identity(),
+            key_of(self._photos),
+            file_identity(photos),
         ]
-        return [self._bare.identity(), key_of(self._photos), file_identity(photos)]
 
     def absolute(self) -> Self:
         found = super().absolute()
@@ -110,10 +122,12 @@ class ColoredStream(PointStream):
 
     def all_notes(self) -> Notes:
         notes = self._bare.all_notes()
-        bare = sum(note.count for note in notes if note.code in _UNCOLORED_NOTES)
-        text = f"{plural(bare, 'point')} without colours take them from the photos that see them"
         kept = tuple(note for note in notes if note.code not in _UNCOLORED_NOTES)
-        return (*kept, Note("photo_colors", bare, text)) if bare else kept
+        bare = sum(note.count for note in notes if note.code in _UNCOLORED_NOTES)
+        if not bare:
+            return kept
+        text = f"{plural(bare, 'point')} without colours take them from the photos that see them"
+        return (*kept, Note("photo_colors", bare, text))
 
     def raw(self, rows: int, start: int) -> Iterator[MarkedPoints]:
         return self._bare.raw(rows, start)
@@ -199,10 +213,18 @@ def median_colors(
     return colors, count > 0
 
 
-def _find_seen(positions: Float, hiding: Float, cameras: Cameras, view: int) -> tuple[Rows, Mask]:
+def _find_seen(
+    positions: Float,
+    hiding: Float,
+    cameras: Cameras,
+    view: int,
+) -> tuple[Rows, Mask]:
     """Return (N, 2) columns and rows of points in a view, and whether they are inside and not hidden."""
     own = _project(positions, cameras, view)
-    others, depths, drawn = own if hiding is positions else _project(hiding, cameras, view)
+    if hiding is positions:
+        others, depths, drawn = own
+    else:
+        others, depths, drawn = _project(hiding, cameras, view)
     pixels, depth, inside = own
     width = int(cameras.widths[view])
     height = int(cameras.heights[view])
@@ -225,12 +247,18 @@ def _project(positions: Float, cameras: Cameras, view: int) -> tuple[Rows, Float
     """Return (N, 2) columns and rows of points in a view, their depths, and whether they are inside."""
     width = int(cameras.widths[view])
     height = int(cameras.heights[view])
-    pose = cameras.viewmats[view].astype(np.float64)
-    K = cameras.Ks[view]
+    pose = cameras.viewmats[view]
+    (fx, _, cx), (_, fy, cy), _ = cameras.Ks[view]
     local = positions @ pose[:3, :3].T + pose[:3, 3]
     depth = local[:, 2]
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        u = local[:, 0] / depth * K[0, 0] + K[0, 2]
-        v = local[:, 1] / depth * K[1, 1] + K[1, 2]
-    inside = (depth > 0) & (u >= 0) & (v >= 0) & (u < width) & (v < height)
-    return np.where(inside[:, None], np.stack([u, v], axis=1), 0).astype(np.intp), depth, inside
+        u = local[:, 0] / depth * fx + cx
+        v = local[:, 1] / depth * fy + cy
+    inside = within_frame(u, v, width, height)
+    inside &= depth > 0
+    pixels = np.where(
+        inside[:, None],
+        np.stack([u, v], axis=1),
+        0,
+    )
+    return pixels.astype(np.intp), depth, inside

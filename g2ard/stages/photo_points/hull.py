@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from g2ard.arrays import Float, Mask
-from g2ard.scene.cameras import Cameras
+from g2ard.scene.cameras import Cameras, within_frame
 
 _COARSE_VOXELS = 64
 """Voxels per side of the grid that finds the object's box."""
@@ -38,9 +38,10 @@ class VisualHull:
         """Return whether (…, 3) world points lie in filled voxels."""
         at = np.floor((points - self.low) / self.side).astype(np.int64)
         inside: Mask = np.all((at >= 0) & (at < self.filled.shape), axis=-1)
-        x, y, z = np.moveaxis(np.where(inside[..., None], at, 0), -1, 0)
-        inside_hull: Mask = inside & self.filled[x, y, z]
-        return inside_hull
+        at = np.where(inside[..., None], at, 0)
+        x, y, z = np.moveaxis(at, -1, 0)
+        inside &= self.filled[x, y, z]
+        return inside
 
     def depths(self, cameras: Cameras, view: int, count: int) -> Float:
         """Return (count,) depths that cover the grid's box in a view, evenly spaced."""
@@ -87,7 +88,11 @@ def visual_hull(
 
 
 def _outline_view(
-    cameras: Cameras, view: int, outline: Mask | None, middle: Float, side: Float
+    cameras: Cameras,
+    view: int,
+    outline: Mask | None,
+    middle: Float,
+    side: Float,
 ) -> tuple[Float, Mask]:
     """Return a view's (3, 4) projection to pixels, and the pixels that a voxel touching the object may have:
     the outline, grown by half the diagonal of a voxel."""
@@ -98,13 +103,20 @@ def _outline_view(
     return projection, grown(outline, int(np.ceil(radius)))
 
 
-def _carve(views: Sequence[tuple[Float, Mask]], low: Float, side: Float, count: int) -> Mask:
+def _carve(
+    views: Sequence[tuple[Float, Mask]],
+    low: Float,
+    side: Float,
+    count: int,
+) -> Mask:
     """Return the (count, count, count) voxels that are in sight and within the outlines."""
     steps = np.arange(count) + 0.5
     most_empty = _EMPTY_VIEWS_SHARE * len(views)
+    least_seen = _SEEING_VIEWS_SHARE * len(views)
     filled = np.zeros((count, count * count), bool)
-    y_and_z = np.stack(np.meshgrid(steps, steps, indexing="ij"), -1).reshape(-1, 2)
-    plane = y_and_z * side[1:] + low[1:]  # centres of a slab's voxels
+    y_and_z = np.meshgrid(steps, steps, indexing="ij")
+    plane = np.stack(y_and_z, -1).reshape(-1, 2)
+    plane = plane * side[1:] + low[1:]  # centres of a slab's voxels
     for slab, x in enumerate(low[0] + steps * side[0]):
         points = plane
         left = np.arange(len(plane))  # voxels that are not carved away
@@ -115,18 +127,20 @@ def _carve(views: Sequence[tuple[Float, Mask]], low: Float, side: Float, count: 
             ahead = points @ P[:, 1:3].T + (P[:, 0] * x + P[:, 3])
             depth = np.maximum(ahead[:, 2], 1e-9)
             u, v = (ahead[:, :2] / depth[:, None]).T
-            inside = (ahead[:, 2] > 0) & (u >= 0) & (v >= 0) & (u < width) & (v < height)
+            inside = within_frame(u, v, width, height)
+            inside &= ahead[:, 2] > 0
             rows = np.where(inside, v, 0).astype(np.intp)
             columns = np.where(inside, u, 0).astype(np.intp)
             seen += inside
             empty += inside & ~shown[rows, columns]
             kept = empty <= most_empty
-            if not kept.all():
-                points = points[kept]
-                left = left[kept]
-                empty = empty[kept]
-                seen = seen[kept]
-        filled[slab, left] = seen >= _SEEING_VIEWS_SHARE * len(views)
+            if kept.all():
+                continue
+            points = points[kept]
+            left = left[kept]
+            empty = empty[kept]
+            seen = seen[kept]
+        filled[slab, left] = seen >= least_seen
     return filled.reshape(count, count, count)
 
 

@@ -16,7 +16,7 @@ from g2ard.errors import InputError
 from g2ard.io.photos import composite, load_photo
 from g2ard.io.types import Points
 from g2ard.progress import Progress, plural, silent
-from g2ard.scene.cameras import Cameras
+from g2ard.scene.cameras import Cameras, within_frame
 from g2ard.scene.reproducible import merge_equal
 from g2ard.stages.photo_points.hull import VisualHull, grown, visual_hull
 
@@ -36,7 +36,19 @@ _COMPARED_VIEWS = 6
 """Number of nearby views compared."""
 _AGREEING_VIEWS = 2
 """Number of compared views that agree best, whose mean counts."""
-_PATCH = np.array([(0, 0), (-1, -1), (-1, 0), (-1, 1), (0, -1), (0, 1), (1, -1), (1, 0), (1, 1)])
+_PATCH = np.array(
+    [
+        (0, 0),
+        (-1, -1),
+        (-1, 0),
+        (-1, 1),
+        (0, -1),
+        (0, 1),
+        (1, -1),
+        (1, 0),
+        (1, 1),
+    ]
+)
 _PATCH_SPACING = 120
 """Rows and columns of the compared pixels, from a ray's own, in units of this part of the photo's side."""
 _REFINED_DEPTHS = 3
@@ -104,7 +116,10 @@ def points_along_rays(
     outlines: list[Mask | None] = []
     for view in range(len(cameras)):
         image, mask = load_photo(cameras, view, None)
-        outline = image[..., 3] > 0.5 if image.shape[2] == 4 else None
+        if image.shape[2] == 4:
+            outline = image[..., 3] > 0.5
+        else:
+            outline = None
         photos.append(_Photo.of(composite(image, background), mask, outline, background))
         if outline is not None and mask is not None:
             outline = outline | ~mask  # masked pixels do not say that the object is elsewhere
@@ -142,7 +157,10 @@ def points_along_rays(
         positions = np.concatenate([found.positions, xyz])
         found = distinct(Points(positions, np.concatenate([found.colors, rgb])))
         progress("points", min(len(found), count), count)
-    return Points(found.positions[:count], np.ascontiguousarray(found.colors[:count]))
+    return Points(
+        found.positions[:count],
+        np.ascontiguousarray(found.colors[:count]),
+    )
 
 
 def _find_common_centre(cameras: Cameras) -> Float:
@@ -189,19 +207,27 @@ class _Photo:
 
     @classmethod
     def of(
-        cls, image: Float32, mask: Mask | None, outline: Mask | None, background: Colour
+        cls,
+        image: Float32,
+        mask: Mask | None,
+        outline: Mask | None,
+        background: Colour,
     ) -> _Photo:
         step = max(1, round(max(image.shape) / _PATCH_SPACING))
-        shown = (
-            np.abs(image - background).max(2) > _EMPTY_COLOUR_SLACK if outline is None else outline
-        )
+        if outline is None:
+            shown = np.abs(image - background).max(2) > _EMPTY_COLOUR_SLACK
+        else:
+            shown = outline
         if mask is None:
             return cls(image, np.ones_like(shown), shown, step)
         return cls(image, mask, shown & ~grown(~mask, step), step)
 
 
 def _sweep(
-    ray: _Rays, depths: Float, hull: VisualHull | None, slack: float
+    ray: _Rays,
+    depths: Float,
+    hull: VisualHull | None,
+    slack: float,
 ) -> tuple[Float, Float32]:
     """Return points on rays, with colours.
 
@@ -234,16 +260,18 @@ def _refine(ray: _Rays, trial: Float, cost: Float) -> tuple[Float, Float]:
     of a spacing to both sides, past the middle between two trials.
     """
     padded = np.pad(cost, ((0, 0), (1, 1)), constant_values=np.inf)
-    is_minimum = (cost <= padded[:, :-2]) & (cost <= padded[:, 2:])
+    is_minimum = cost <= padded[:, :-2]
+    is_minimum &= cost <= padded[:, 2:]
     minima = np.where(is_minimum, cost, np.inf)
     order = np.argsort(minima, axis=1, kind="stable")[:, :_REFINED_DEPTHS]
     rows = np.arange(len(cost))
     inverse_depth = 1 / trial[rows[:, None], order]
+    inverse_depth = inverse_depth[:, :, None]
     spacing = np.abs(1 / trial[:, :1] - 1 / trial[:, 1:2])
     offsets = np.linspace(-0.75, 0.75, _FINER_DEPTHS)
-    tried = inverse_depth[:, :, None] + offsets * spacing[:, :, None]
-    least = 1e-3 * inverse_depth[:, :, None]
-    finer = (1 / np.maximum(tried, least)).reshape(len(cost), order.shape[1] * len(offsets))
+    tried = inverse_depth + offsets * spacing[:, :, None]
+    finer = 1 / np.maximum(tried, 1e-3 * inverse_depth)
+    finer = finer.reshape(len(cost), -1)
     costs = ray.costs(finer)
     best = costs.argmin(1)
     return finer[rows, best], costs[rows, best]
@@ -276,15 +304,28 @@ class _Rays:
         others: Int,
         pixels: Int,
     ) -> _Rays:
-        photo = shots[view].image
+        photo = shots[view]
         pose = cameras.viewmats[view]
-        patch = _PATCH * shots[view].step
-        rows = np.clip(pixels[0][:, None] + patch[:, 0], 0, photo.shape[0] - 1)
-        columns = np.clip(pixels[1][:, None] + patch[:, 1], 0, photo.shape[1] - 1)
-        seen = np.stack([columns + 0.5, rows + 0.5, np.ones(rows.shape)], -1)
-        aims = seen @ np.linalg.inv(cameras.Ks[view]).T @ pose[:3, :3]
-        patches = photo[rows, columns].astype(np.float64)
-        return cls(cameras, shots, others, cameras.positions[view], aims, patches)
+        height, width, _ = photo.image.shape
+        patch_rows, patch_columns = (_PATCH * photo.step).T
+        rows = np.clip(pixels[0][:, None] + patch_rows, 0, height - 1)
+        columns = np.clip(pixels[1][:, None] + patch_columns, 0, width - 1)
+        seen = np.stack(
+            [
+                columns + 0.5,
+                rows + 0.5,
+                np.ones(rows.shape),
+            ],
+            axis=-1,
+        )
+        return cls(
+            cameras,
+            shots,
+            others,
+            origin=cameras.positions[view],
+            aims=seen @ np.linalg.inv(cameras.Ks[view]).T @ pose[:3, :3],
+            patches=photo.image[rows, columns].astype(np.float64),
+        )
 
     @property
     def colors(self) -> Float32:
@@ -298,13 +339,14 @@ class _Rays:
     def costs(self, depths: Float) -> Float:
         """Return (N, D) differences of the patches to the views that agree best; ∞ if too few see them."""
         own_costs = np.full((len(self.others), *depths.shape), np.inf)
-        for k, other in enumerate(self.others):
+        for k, other in enumerate(self.others.tolist()):
             total = np.zeros(depths.shape)
             inside = np.ones(depths.shape, bool)
             for p in range(self.aims.shape[1]):
                 world = self.origin + self.aims[:, p : p + 1] * depths[..., None]
-                color, held = self._sampled(int(other), world)
-                total += np.abs(color - self.patches[:, p : p + 1]).mean(-1)
+                color, held = self._sampled(other, world)
+                difference = np.abs(color - self.patches[:, p : p + 1])
+                total += difference.mean(-1)
                 inside &= held
             own_costs[k][inside] = total[inside] / self.aims.shape[1]
         own_costs.sort(axis=0)
@@ -312,17 +354,22 @@ class _Rays:
 
     def _sampled(self, view: int, world: Float) -> tuple[Float, Mask]:
         """Return the colours of world points in a photo, and whether it shows them; black if not."""
-        photo = self.photos[view].image
-        height, width, _ = photo.shape
+        photo = self.photos[view]
+        height, width, _ = photo.image.shape
         pose = self.cameras.viewmats[view]
-        K = self.cameras.Ks[view]
-        local = world @ pose[:3, :3].T + pose[:3, 3]
-        ahead = local[..., 2] > 0
-        depth = np.where(ahead, local[..., 2], 1.0)
-        u = np.floor(K[0, 0] * local[..., 0] / depth + K[0, 2])
-        v = np.floor(K[1, 1] * local[..., 1] / depth + K[1, 2])
-        held = ahead & (u >= 0) & (v >= 0) & (u < width) & (v < height)
+        (fx, _, cx), (_, fy, cy), _ = self.cameras.Ks[view]
+        x, y, z = np.moveaxis(
+            world @ pose[:3, :3].T + pose[:3, 3],
+            -1,
+            0,
+        )
+        ahead = z > 0
+        depth = np.where(ahead, z, 1.0)
+        u = np.floor(fx * x / depth + cx)
+        v = np.floor(fy * y / depth + cy)
+        held = ahead & within_frame(u, v, width, height)
         rows = np.where(held, v, 0).astype(int)
         columns = np.where(held, u, 0).astype(int)
-        held = held & self.photos[view].valid[rows, columns]
-        return np.where(held[..., None], photo[rows, columns], 0.0), held
+        held &= photo.valid[rows, columns]
+        colors = photo.image[rows, columns]
+        return np.where(held[..., None], colors, 0.0), held

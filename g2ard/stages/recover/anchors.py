@@ -13,7 +13,7 @@ from g2ard.config.schema import Settings
 from g2ard.errors import InputError, require
 from g2ard.io.reports import Report
 from g2ard.rendering.renderer import RasterSettings, Renderer
-from g2ard.scene.cameras import Cameras
+from g2ard.scene.cameras import Cameras, within_frame
 from g2ard.scene.samples import evenly_spaced
 from g2ard.scene.shape import needle_share
 from g2ard.scene.splats import Splats
@@ -147,7 +147,8 @@ def drift95(anchors: Anchors, means: Float32) -> float:
     if not len(means):
         return 0.0
     delta = means.astype(np.float64) - anchors.means
-    height = np.einsum("nj,nj->n", anchors.frames[:, :, 2].astype(np.float64), delta)
+    normals = anchors.frames[:, :, 2].astype(np.float64)
+    height = np.einsum("nj,nj->n", normals, delta)
     return float(np.percentile(np.abs(height) / anchors.r_perp, 95))
 
 
@@ -207,7 +208,10 @@ def measure_prior(prior: Splats, cameras: Cameras | None = None) -> PriorMeasure
     scales = np.sort(prior.scales.astype(np.float64), axis=1)
     tiny = np.finfo(np.float32).tiny
     thickness = scales[:, 0] / np.maximum(scales[:, 1], tiny)
-    low, middle, high = np.quantile(thickness, [0.25, 0.5, 0.75]) if len(prior) else (1.0, 1.0, 1.0)
+    if len(prior):
+        low, middle, high = np.quantile(thickness, [0.25, 0.5, 0.75])
+    else:
+        low, middle, high = (1.0, 1.0, 1.0)
     return PriorMeasures(
         needle=needle_share(prior.scales),
         thickness=float(middle),
@@ -228,7 +232,8 @@ def measure_view_consistency(scene: Splats, cameras: Cameras) -> float | None:
         return None
     small = cameras.resized(_SAMPLE_PIXELS)
     renderer = Renderer(scene, settings=RasterSettings(antialiased=False))
-    agreeing = floating = 0
+    agreeing = 0
+    floating = 0
     for a in evenly_spaced(len(small), _SAMPLE_VIEWS):
         distance = np.linalg.norm(small.positions - small.positions[a], axis=1)
         distance[a] = np.inf
@@ -240,7 +245,9 @@ def measure_view_consistency(scene: Splats, cameras: Cameras) -> float | None:
         ratio = np.where(seen > 0, seen, np.inf) / expected
         agreeing += int((np.abs(ratio - 1) <= _SAME_DEPTH).sum())
         floating += int((ratio > 1 + _SAME_DEPTH).sum())
-    return agreeing / (agreeing + floating) if agreeing + floating else None
+    if agreeing + floating:
+        return agreeing / (agreeing + floating)
+    return None
 
 
 def _carry_depths(
@@ -248,15 +255,23 @@ def _carry_depths(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Project points of view `a` into view `b`; return their depth there, and the depth that `b` sees."""
     rows, columns = np.nonzero(depth > 0)
-    pixels = np.stack([columns + 0.5, rows + 0.5, np.ones(len(rows))])
+    pixels = np.stack(
+        [
+            columns + 0.5,
+            rows + 0.5,
+            np.ones(len(rows)),
+        ]
+    )
     rays = np.linalg.inv(cameras.Ks[a]) @ pixels * depth[rows, columns]
     b_from_a = cameras.viewmats[b] @ np.linalg.inv(cameras.viewmats[a])
     points = b_from_a[:3, :3] @ rays + b_from_a[:3, 3:]
     points = points[:, points[2] > 1e-6]
     u, v, _ = np.floor(cameras.Ks[b] @ points / points[2])
     height, width = other.shape
-    inside = (u >= 0) & (v >= 0) & (u < width) & (v < height)
-    return points[2, inside], other[v[inside].astype(int), u[inside].astype(int)]
+    inside = within_frame(u, v, width, height)
+    row = v[inside].astype(int)
+    column = u[inside].astype(int)
+    return points[2, inside], other[row, column]
 
 
 def choose_regularizers(
@@ -292,21 +307,25 @@ def choose_regularizers(
         )
     paper = paper or name.startswith("paper")
     measures = measure_prior(prior, cameras)
-    kind, why = (kind, "as requested") if kind != "auto" else _judge(measures)
+    why = "as requested"
+    if kind == "auto":
+        kind, why = _judge(measures)
     said = f"the paper's for {kind}" if paper else kind
     return Regularizers.of(kind, paper=paper), f"{said} ({why})", measures
 
 
 def _judge(m: PriorMeasures) -> tuple[str, str]:
-    needles = f"{m.needle:.1%} of the Gaussians are needles"
     if m.is_lift:
         return (
             "lift",
             "thin discs of equal proportions and colours without view dependence: not trained yet",
         )
+    needles = f"{m.needle:.1%} of the Gaussians are needles"
     if m.needle > _MANY_NEEDLES:
         return "noisy", needles
     if m.consistency is None:
         return "trained", needles
-    agree = f"{m.consistency:.0%} of the surface agrees between neighbouring views"
-    return ("noisy" if m.consistency < _LEAST_CONSISTENCY else "trained"), f"{needles}, {agree}"
+    why = f"{needles}, {m.consistency:.0%} of the surface agrees between neighbouring views"
+    if m.consistency < _LEAST_CONSISTENCY:
+        return "noisy", why
+    return "trained", why

@@ -158,14 +158,20 @@ class Schedule(Settings):
         800
         """
         share = steps / self.steps
-        rounds = max(1, round(self.round_steps * share)) if self.round_steps else 0
+        if self.round_steps:
+            rounds = max(1, round(self.round_steps * share))
+        else:
+            rounds = 0
         return replace(self, steps=steps, round_steps=rounds)
 
     def at(
         self, t: float, *, final: bool, multiplier: float = 1.0, reach: float = math.inf
     ) -> Rates:
         """Return the rates at the share `t` of the steps, from 0 at the first to 1 after the last."""
-        fall = 1.0 if self.final_rate is None else 1 - (1 - self.final_rate) * t
+        if self.final_rate is None:
+            fall = 1.0
+        else:
+            fall = 1 - (1 - self.final_rate) * t
         decay = self.appearance_decay[1 if final else 0] ** t
         geometry = fall * multiplier
         appearance = fall * decay * multiplier
@@ -237,7 +243,9 @@ def choose_reach(start_rmse: float, typical: float) -> float:
     >>> choose_reach(0.02, 0.005), choose_reach(0.05, 0.04), choose_reach(0.15, 0.005)
     (0.01, 0.04, inf)
     """
-    return max(_DEFAULT_REACH, typical) if start_rmse < _UNTRAINED_RMSE else math.inf
+    if start_rmse < _UNTRAINED_RMSE:
+        return max(_DEFAULT_REACH, typical)
+    return math.inf
 
 
 def count_steps_from_points(count: int, steps: int) -> int:
@@ -334,7 +342,9 @@ class RecoverConfig(FitConfig):
         """Number of steps of this recovery."""
         if self.steps is not None:
             return self.steps
-        return self.schedule.steps if self.final else self.schedule.round_steps
+        if self.final:
+            return self.schedule.steps
+        return self.schedule.round_steps
 
     def final_steps(self, scene: Splats, cameras: Cameras, *, of_photos: bool) -> int:
         """Return the steps of the last recovery: as set, the schedule's, or more by need.

@@ -9,7 +9,7 @@ import numpy as np
 import g2ard._core as _core
 from g2ard.arrays import Float32, Mask, Values
 from g2ard.rendering.renderer import RasterSettings, arrays_of, view_of
-from g2ard.scene.cameras import Cameras
+from g2ard.scene.cameras import Cameras, within_frame
 from g2ard.scene.samples import evenly_spaced
 from g2ard.scene.shape import NEEDLE_UNIT, longer_axes
 from g2ard.scene.splats import Splats
@@ -56,10 +56,13 @@ def measure_typical_share(splats: Splats, cameras: Cameras) -> float:
         front = at[:, 2] > 0
         depth = np.where(front, at[:, 2], 1.0)
         pixel = at[:, :2] / depth[:, None]
-        inside = front & ((pixel >= 0) & (pixel < size)).all(1)
-        view_shares.append(largest[inside] / depth[inside] * (K[0, 0] / size.max()))
+        inside = front & within_frame(*pixel.T, *size)
+        focal = K[0, 0] / size.max()
+        view_shares.append(largest[inside] / depth[inside] * focal)
     shares = np.concatenate(view_shares)
-    return float(np.median(shares)) if len(shares) else 0.0
+    if not len(shares):
+        return 0.0
+    return float(np.median(shares))
 
 
 TYPICAL_LOSS = 0.02
@@ -116,7 +119,10 @@ class FusedEngine:
         self._objective = objective
         start = objective.start
         anchors = objective.anchors
-        units = measure_radii(start) if objective.means_in_scales else None
+        if objective.means_in_scales:
+            units = measure_radii(start)
+        else:
+            units = None
         self._trainer = _core.Trainer(arrays_of(start), objective, units)
         self._skipped_before = 0
         self._anchors = (
@@ -159,7 +165,11 @@ class FusedEngine:
         """Return the current scene, with normalised quaternions."""
         means, quats, log_scales, logit_opacities, sh0, shN = self._trainer.arrays()
         length = np.linalg.norm(quats, axis=1, keepdims=True)
-        quats = np.where(length > 0, quats / np.where(length > 0, length, 1), [1.0, 0.0, 0.0, 0.0])
+        quats = np.where(
+            length > 0,
+            quats / np.where(length > 0, length, 1),
+            [1.0, 0.0, 0.0, 0.0],
+        )
         return replace(
             self._objective.start,
             means=means,

@@ -77,13 +77,21 @@ class Guard:
 
     def rescore(self) -> None:
         """Score the best scene again, after a change of the score."""
-        self.best_score = self.before if self.best is self.start else self.score(self.best)
+        if self.best is self.start:
+            self.best_score = self.before
+        else:
+            self.best_score = self.score(self.best)
 
     def is_due(self, share: float) -> bool:
         """Return whether the scene should be scored at this share of the horizon."""
         return self.active and self.looked < len(LOOKS) and LOOKS[self.looked] <= share < 1
 
-    def look(self, scene: Splats, share: float, step: int) -> Literal["on", "back", "stop"]:
+    def look(
+        self,
+        scene: Splats,
+        share: float,
+        step: int,
+    ) -> Literal["on", "back", "stop"]:
         """Score a scene, and decide to go on, to go back to the best one with smaller steps, or to stop."""
         while self.is_due(share):
             self.looked += 1
@@ -121,7 +129,8 @@ class Guard:
         """
         if not self.validation:
             return 0.0
-        before, now = (self.validation[look]["psnr"] for look in (0, -1))
+        before = self.validation[0]["psnr"]
+        now = self.validation[-1]["psnr"]
         return sum(before[kind] - now[kind] for kind in before) / len(before)
 
     def _find_least_gain(self, scores: dict[str, float]) -> float:
@@ -154,7 +163,8 @@ class Guard:
                 break
             kept = k
             (best, scores, mean) = other
-        if (harmful := self.harmful(best)) is not None:
+        harmful = self.harmful(best)
+        if harmful is not None:
             other = self._judge(blend(self.start, best, ~harmful))
             if other[2] > mean:
                 best, scores, mean = other
@@ -191,11 +201,12 @@ class Guard:
         for k, share in shares:
             part = blend(self.start, result, share)
             found = self.others(part)
-            if self._find_least_gain(found) > most:
+            gain = self._find_least_gain(found)
+            if gain > most:
                 best = part
                 chosen = k
                 scores = found
-                most = self._find_least_gain(found)
+                most = gain
         return best, chosen, scores
 
     def choose_by_training(self, result: Splats) -> tuple[Splats, float, float]:
@@ -231,7 +242,10 @@ class Guard:
         for name in _STATE:
             setattr(self, name, meta[name])
         best_arrays = {name: arrays.pop(_BEST + name) for name in ARRAYS if _BEST + name in arrays}
-        self.best = replace(self.start, **best_arrays) if best_arrays else self.start
+        if best_arrays:
+            self.best = replace(self.start, **best_arrays)
+        else:
+            self.best = self.start
 
     def meta(self) -> dict[str, Any]:
         """Return the state that a checkpoint stores besides the best scene."""
@@ -249,11 +263,21 @@ def blend(start: Splats, end: Splats, share: ArrayLike) -> Splats:
     mixed = []
     for row, (a, b) in enumerate(zip(arrays_of(start), arrays_of(end), strict=True)):
         if row == 1:  # q and −q are the same rotation: take the nearer one
-            a = a * np.where((a * b).sum(1, keepdims=True) < 0, -1, 1)
+            is_opposite = (a * b).sum(1, keepdims=True) < 0
+            a = a * np.where(is_opposite, -1, 1)
         weights = weight.reshape(-1, *[1] * (a.ndim - 1))
         mixed.append((a + weights * (b - a)).astype(np.float32))
     means, quats, log_scales, logits, sh0, shN = mixed
     scales = np.exp(log_scales.astype(np.float64)).astype(np.float32)
     return Splats(
-        means, quats, scales, logits, sh0, shN, end.offset, end.render_model, end.up, end.axes
+        means,
+        quats,
+        scales,
+        logits,
+        sh0,
+        shN,
+        end.offset,
+        end.render_model,
+        end.up,
+        end.axes,
     )

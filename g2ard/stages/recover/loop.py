@@ -132,7 +132,10 @@ class Loop:
     def _new_engine(self, start: Splats | None = None) -> Engine:
         """Create an engine that begins at `start`, by default at the student."""
         config = self.config
-        student = self.student if start is None else start
+        if start is None:
+            student = self.student
+        else:
+            student = start
         objective = Objective(
             settings=settings_for(self.anchors.means, antialiased=student.antialiased),
             background=config.background,
@@ -161,7 +164,10 @@ class Loop:
         limit = self.config.recovery_time
         rmse = 10 ** (-start / 20)
         typical = measure_typical_share(self.student, self.targets.cameras)
-        self.reach = choose_reach(rmse, typical) if schedule.reach is None else schedule.reach
+        if schedule.reach is None:
+            self.reach = choose_reach(rmse, typical)
+        else:
+            self.reach = schedule.reach
         if schedule.multiplier is not None:
             self.multiplier = schedule.multiplier
             return
@@ -173,7 +179,10 @@ class Loop:
         ):
             return
         if steps := count_trial_steps(self.config.horizon, limit):
-            tight = choose_reach(0.0, typical) if schedule.reach is None else self.reach
+            if schedule.reach is None:
+                tight = choose_reach(0.0, typical)
+            else:
+                tight = self.reach
             with checkpoints.defer_interrupt() as interrupted:
                 trials = Trials(partial(self._trial, steps, interrupted), start, limit)
                 self._choose_by_trials(trials, rmse, tight)
@@ -192,7 +201,10 @@ class Loop:
                 self.reach = tight  # better trained than its error suggested
                 self.multiplier = trials.search(guess)
             if trials.worsens(self.multiplier):  # on nearly fitted photos a few steps say nothing
-                self.multiplier = trials.calm() if nearly_fitted else min(guess, self.multiplier)
+                if nearly_fitted:
+                    self.multiplier = trials.calm()
+                else:
+                    self.multiplier = min(guess, self.multiplier)
         except TimeoutError:  # take the best multiplier tried, or a calmer one
             best = trials.best(guess)
             if trials.scores.get(best, -math.inf) >= trials.start:
@@ -200,7 +212,13 @@ class Loop:
             elif nearly_fitted:
                 self.multiplier = min(best / 3, guess_multiplier(rmse, 0.01))
 
-    def _trial(self, steps: int, interrupted: Event, multiplier: float, end: float) -> float:
+    def _trial(
+        self,
+        steps: int,
+        interrupted: Event,
+        multiplier: float,
+        end: float,
+    ) -> float:
         """Return the PSNR after a few steps from the start; raise TimeoutError at `end` (monotonic)."""
         engine = self._new_engine()
         try:
@@ -236,7 +254,14 @@ class Loop:
                 self.targets, view, self.exposures[view], self.config.background
             )
         fixed = self.exposures is None
-        return engine.step(view, target, rates, regularize=regularize, mask=mask, fixed=fixed)
+        return engine.step(
+            view,
+            target,
+            rates,
+            regularize=regularize,
+            mask=mask,
+            fixed=fixed,
+        )
 
     def run(
         self, checkpoint: Path | None, progress: Progress, stage: str, watch: Watch | None
@@ -256,7 +281,10 @@ class Loop:
         while True:
             try:
                 self._run(checkpoint, progress, stage, watch)
-                seen = None if self.validation_key is None else self._estimate_seen()
+                if self.validation_key is None:
+                    seen = None
+                else:
+                    seen = self._estimate_seen()
                 end = self.engine.splats()
                 self._drop_engine()
                 return end, seen
@@ -274,7 +302,10 @@ class Loop:
     def _estimate_seen(self) -> Float:
         """Estimate the (N,) number of views that each Gaussian was seen in from its steps."""
         backed_off = self.guard.backed_off
-        first = int(backed_off[-1]["step"]) if backed_off else 0
+        if backed_off:
+            first = int(backed_off[-1]["step"])
+        else:
+            first = 0
         return self.engine.counts * (len(self.targets.cameras) / max(1, self.done - first))
 
     def _run(
@@ -368,11 +399,10 @@ class Loop:
     def regularizers(self) -> Regularized:
         """Steps and cost of the regularisers."""
         (plain, plain_seconds), (regularized, regularized_seconds) = self.tally
-        extra = (
-            regularized_seconds - regularized * plain_seconds / plain
-            if plain and regularized
-            else 0.0
-        )
+        if plain and regularized:
+            extra = regularized_seconds - regularized * plain_seconds / plain
+        else:
+            extra = 0.0
         share = max(0.0, extra) / max(plain_seconds + regularized_seconds, 1e-9)
         weights = self.config.regularizers
         return Regularized(int(regularized), share, weights.period if weights.active else 0)
@@ -382,7 +412,8 @@ class Loop:
         recent = np.mean(self.losses[-20:])
         total = self.config.horizon
         if self.config.recovery_time is not None:
-            total = max(self.done, round(self.done / max(self._measure_share(), 1e-9)))
+            share = max(self._measure_share(), 1e-9)
+            total = max(self.done, round(self.done / share))
         figures = {"loss": f"{recent:.4f}", "steps/s": f"{speed:.1f}"}
         if self.done < total:  # the report has the result's
             shown, at = self.probe.score_latest(self.engine.splats, self.done, self.seconds)

@@ -27,13 +27,13 @@ def measure_extents(
     """
     pose = torch.from_numpy(cameras.viewmats[view]).to(means)
     K = cameras.Ks[view]
-    focal = torch.tensor([K[0, 0], K[1, 1]]).to(means)
+    focals = K.diagonal()[:2]
+    centre = K[:2, 2]
     size = np.array([cameras.widths[view], cameras.heights[view]])
-    centre, margin = K[:2, 2], 0.15 * size  # as in the rasteriser: 1.3 half-fields of view
-    low, high = (
-        torch.from_numpy(edge / K.diagonal()[:2]).to(means)
-        for edge in (-centre - margin, size - centre + margin)
-    )
+    margin = 0.15 * size  # as in the rasteriser: 1.3 half-fields of view
+    low = torch.from_numpy((-centre - margin) / focals).to(means)
+    high = torch.from_numpy((size - centre + margin) / focals).to(means)
+    focal = torch.from_numpy(focals.copy()).to(means)
     camera = means @ pose[:3, :3].T + pose[:3, 3]
     seen = camera[:, 2] >= near
     depth = torch.where(seen, camera[:, 2], 1.0)[:, None]
@@ -44,7 +44,8 @@ def measure_extents(
     xx = (x * x).sum(1)
     xy = (x * y).sum(1)
     yy = (y * y).sum(1)
-    largest = 0.5 * (xx + yy) + ((0.5 * (xx - yy)) ** 2 + xy**2).sqrt()
+    difference = 0.5 * (xx - yy)
+    largest = 0.5 * (xx + yy) + (difference**2 + xy**2).sqrt()
     return largest * seen, (axes**2).sum(1) * seen[:, None]
 
 
@@ -59,9 +60,21 @@ def build_rotations(quats: Tensor) -> Tensor:
     """Return (N, 3, 3) matrices of (N, 4) wxyz quaternions of any length, differentiably."""
     w, x, y, z = normalize(quats, dim=1).unbind(1)
     rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        [
+            1 - 2 * (y * y + z * z),
+            2 * (x * y - w * z),
+            2 * (x * z + w * y),
+        ],
+        [
+            2 * (x * y + w * z),
+            1 - 2 * (x * x + z * z),
+            2 * (y * z - w * x),
+        ],
+        [
+            2 * (x * z - w * y),
+            2 * (y * z + w * x),
+            1 - 2 * (x * x + y * y),
+        ],
     ]
     return torch.stack([torch.stack(row, 1) for row in rows], 1)
 
@@ -72,7 +85,10 @@ class _L1Ssim(torch.autograd.Function):
         ctx: Any, image: Tensor, target: Tensor, ssim_weight: float, mask: Tensor | None
     ) -> Tensor:
         a, b = (t.detach().contiguous().numpy() for t in (image, target))
-        counts = None if mask is None else mask.contiguous().numpy()
+        if mask is None:
+            counts = None
+        else:
+            counts = mask.contiguous().numpy()
         loss, gradient = _core.l1_ssim(a, b, ssim_weight, counts)
         ctx.save_for_backward(torch.from_numpy(gradient))
         return image.new_tensor(loss)
@@ -120,16 +136,16 @@ def shape_loss(
     log_scales: Tensor, quats: Tensor, anchors: Anchors, weights: Regularizers
 ) -> Tensor:
     """Return (1/N) Σ max(0, −log(r_eff − 1 + ε)) + β[log s⊥ − log s̄⊥]₊, with s⊥ along the anchor's normal."""
-    normal, r_perp = (
-        torch.from_numpy(a).to(quats) for a in (anchors.frames[:, :, 2], anchors.r_perp)
-    )
+    normal = torch.from_numpy(anchors.frames[:, :, 2]).to(quats)
+    r_perp = torch.from_numpy(anchors.r_perp).to(quats)
     extent = torch.einsum("nji,nj->ni", build_rotations(quats), normal) * log_scales.exp()
     thickness = extent.square().sum(1).clamp_min(1e-38).log() / 2 - r_perp.log()
     total = weights.thickness * thickness.clamp_min(0)
     if weights.effective_rank:
         log_q = torch.log_softmax(log_scales, dim=1)  # log(s / Σs)
         rank = torch.exp(-(log_q.exp() * log_q).sum(1))
-        total = total + (-torch.log((rank - 1).clamp_min(0) + weights.rank_offset)).clamp_min(0)
+        barrier = -torch.log((rank - 1).clamp_min(0) + weights.rank_offset)
+        total = total + barrier.clamp_min(0)
     return total.mean()
 
 

@@ -82,9 +82,11 @@ def recover(
 
     Other arguments, results and errors are those of `g2ard.recover`.
     """
-    config, student = config or RecoverConfig(), student.narrowed()
+    config = config or RecoverConfig()
+    student = student.narrowed()
     unit = unit_quats(student.quats)
-    student = student if unit is student.quats else replace(student, quats=unit)
+    if unit is not student.quats:
+        student = replace(student, quats=unit)
     if not len(student) or not len(targets.cameras):
         raise InputError(
             f"nothing to recover: got {len(student)} Gaussians and {len(targets.cameras)} views"
@@ -99,22 +101,37 @@ def recover(
     if config.sh_degree is not None:
         student = student.with_sh_degree(config.sh_degree)
     anchors = anchors or Anchors.of(student, config.regularizers.in_plane)
-    validation = validation if config.schedule.guarded else None
+    if not config.schedule.guarded:
+        validation = None
     probe = Probe(targets, config.background)
     progress(stage, 0, 0)
     before = probe.score(student)
     view_weights = check_weights(weights, len(targets.cameras))
     exact = skip_same and before >= _SAME_PSNR and config.schedule.guarded
-    validation = None if exact else validation
-    others = None if validation is None else score_by_kind(validation, config.background)
+    if exact:
+        validation = None
+    if validation is None:
+        others = None
+    else:
+        others = score_by_kind(validation, config.background)
 
     def harmful(scene: Splats) -> Mask | None:
         if validation is None:
             return None
         return find_harmful_changes(student, scene, validation, targets, config.background)
 
-    guard = Guard(probe.score, student, before, others, harmful, config.schedule.guarded)
-    validation_key = None if validation is None else fingerprint_of(validation)
+    guard = Guard(
+        probe.score,
+        student,
+        before,
+        others,
+        harmful,
+        config.schedule.guarded,
+    )
+    if validation is None:
+        validation_key = None
+    else:
+        validation_key = fingerprint_of(validation)
     end = result = student
     after = before
     blend = 1.0
@@ -138,7 +155,10 @@ def recover(
         progress(stage, 0, 0)
         result, after, blend = guard.choose_by_training(end)
     limited = config.recovery_time is not None and not exact
-    pace = guard.measure_pace(loop.done, after) if limited and result is end else None
+    if limited and result is end:
+        pace = guard.measure_pace(loop.done, after)
+    else:
+        pace = None
     prior_views: float | None = 0.0
     if result is end and seen is not None:
         result, prior_views = guard.choose_by_validation(end, seen, loop.done)
@@ -147,7 +167,10 @@ def recover(
             blend = float(result is not student)
     validated = None
     if validation is not None:
-        shrunk = None if prior_views is None else write_finite(prior_views)
+        if prior_views is None:
+            shrunk = None
+        else:
+            shrunk = write_finite(prior_views)
         validated = Validation(tuple(map(Look.of, guard.validation)), shrunk)
     return Recovered(
         result,

@@ -157,7 +157,9 @@ class _Comparison:
         for renderer in self._renderers:
             away = renderer.clipped(camera) - np.asarray(target, np.float32)
             errors.append(np.einsum("yxc,yxc->yx", away, away) / 3)
-        return errors if mask is None else [error * mask for error in errors]
+        if mask is None:
+            return errors
+        return [error * mask for error in errors]
 
     def lost(self, view: int) -> float:
         """Return a view's loss in dB."""

@@ -22,7 +22,10 @@ class Gain(Report):
     views: str | None = field(default=None, metadata=LEFT_OUT)
 
     def __str__(self) -> str:
-        where = f" in {self.views}" if self.views else ""
+        if self.views:
+            where = f" in {self.views}"
+        else:
+            where = ""
         return f"PSNR {self.before:.2f} → {self.after:.2f} dB{where}"
 
 
@@ -148,20 +151,32 @@ def describe_outcome(report: RecoverReport) -> str | None:
     lines = [f"{found.psnr:.2f} dB {start} at step {found.step}" for found in report.backed_off]
     if report.kept_start:
         why = "every step made the training views worse"
-        looks = report.validation.looks if report.validation else ()
+        if report.validation:
+            looks = report.validation.looks
+        else:
+            looks = ()
         if len(looks) > 2 and looks[-1].psnr == looks[0].psnr:
             first = looks[0].psnr
             end = looks[-2].psnr
             kind = min(first, key=lambda kind: end[kind] - first[kind])
-            name = "" if kind == USUAL else f" of kind {kind}"
+            if kind == USUAL:
+                name = ""
+            else:
+                name = f" of kind {kind}"
             change = f"{first[kind]:.2f} → {end[kind]:.2f} dB"
             why = f"every step made validation views{name} worse ({change}; scores are of other views)"
         if lines:
             why = f"recovery fell to {', '.join(lines)}, and slower rates gained nothing"
-        given_up = "" if report.stopped is None else f"; given up at step {report.stopped}"
+        if report.stopped is None:
+            given_up = ""
+        else:
+            given_up = f"; given up at step {report.stopped}"
         return f"kept the start: {why}{given_up}"
     if lines:
-        thirds = "a third" if len(lines) == 1 else f"1/{3 ** len(lines)}"
+        if len(lines) == 1:
+            thirds = "a third"
+        else:
+            thirds = f"1/{3 ** len(lines)}"
         return f"recovery fell to {', '.join(lines)}: continued from the best scene with {thirds} of the rates"
     if report.blend < 1:
         return (
@@ -216,8 +231,14 @@ def describe_idle_regularizers(rounds: Sequence[Sequence[RecoverReport]]) -> str
         return None
     period = next(iter(idle.values())).regularizers.period
     steps = sorted({done.steps for done in idle.values()})
-    least = f"{steps[0]}" if len(steps) == 1 else f"{steps[0]} to {steps[-1]}"
-    where = f" in {', '.join(idle)}" if sum(map(len, rounds)) > 1 else ""
+    if len(steps) == 1:
+        least = f"{steps[0]}"
+    else:
+        least = f"{steps[0]} to {steps[-1]}"
+    if sum(map(len, rounds)) > 1:
+        where = f" in {', '.join(idle)}"
+    else:
+        where = ""
     return (
         f"the regularisers never acted{where}: they act every {period} steps, and there were {least} "
         "(--set regularizers.period=…)"

@@ -94,9 +94,10 @@ class TorchEngine:
         splats = objective.start
         self._settings = objective.settings
         self._base = torch.from_numpy(splats.means.astype(np.float32))
-        unit = (
-            measure_radii(splats) if objective.means_in_scales else np.ones(len(splats), np.float32)
-        )
+        if objective.means_in_scales:
+            unit = measure_radii(splats)
+        else:
+            unit = np.ones(len(splats), np.float32)
         self._unit = torch.from_numpy(unit[:, None])
         start = {
             "means": np.zeros((len(splats), 3), np.float32),
@@ -125,7 +126,10 @@ class TorchEngine:
         p = self._parameters
         means = self._base + self._unit * p["means"]
         image = self._render(means, view)
-        counts = None if mask is None else torch.from_numpy(mask)
+        if mask is None:
+            counts = None
+        else:
+            counts = torch.from_numpy(mask)
         loss = l1_ssim(image, torch.from_numpy(target), self._objective.ssim_weight, counts)
         total = loss
         if self._objective.relative:
@@ -147,7 +151,14 @@ class TorchEngine:
         p = self._parameters
         near = self._settings.near_of(view)
         cameras = self._objective.cameras
-        largest, axes = measure_extents(means, p["quats"], p["log_scales"], cameras, view, near)
+        largest, axes = measure_extents(
+            means,
+            p["quats"],
+            p["log_scales"],
+            cameras,
+            view,
+            near,
+        )
         pixels = rates.reach * float(max(cameras.widths[view], cameras.heights[view]))
         whole, own = (share_of_rate(sizes, pixels, rates.finest) for sizes in (largest, axes))
         return {"means": whole[:, None], "quats": whole[:, None], "log_scales": own}
@@ -178,8 +189,10 @@ class TorchEngine:
 
     def state(self) -> dict[str, Values]:
         arrays = {f"p.{name}": value.detach().numpy() for name, value in self._parameters.items()}
-        arrays["base"], arrays["unit"] = self._base.numpy(), self._unit.numpy()
-        arrays["skipped"], arrays["counts"] = np.array(self._adam.skipped), self.counts
+        arrays["base"] = self._base.numpy()
+        arrays["unit"] = self._unit.numpy()
+        arrays["skipped"] = np.array(self._adam.skipped)
+        arrays["counts"] = self.counts
         return arrays | {name: moment.numpy() for name, moment in self._adam.moments.items()}
 
     def load(self, state: dict[str, Values]) -> None:

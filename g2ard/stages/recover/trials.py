@@ -42,7 +42,10 @@ class Trials:
         self.scores: dict[float, float] = {}
         self.start = start
         self._run = run
-        self._limit = math.inf if limit is None else limit
+        if limit is None:
+            self._limit = math.inf
+        else:
+            self._limit = limit
         self._began = time.monotonic()
 
     def search(self, guess: float) -> float:
@@ -77,11 +80,17 @@ class Trials:
                 break
             for i in neighbours:
                 value = self._score(MULTIPLIERS[i], _TRIAL_TIME_SHARE)
-                seen[i] = value if math.isfinite(value) else -math.inf
+                if math.isfinite(value):
+                    seen[i] = value
+                else:
+                    seen[i] = -math.inf
                 if not good(i):
                     break
         best = max(seen, key=lambda i: (seen[i], -i))
-        chosen = max(filter(good, seen)) if seen[best] > self.start else best
+        if seen[best] > self.start:
+            chosen = max(filter(good, seen))
+        else:
+            chosen = best
         return MULTIPLIERS[chosen]
 
     def calm(self) -> float:

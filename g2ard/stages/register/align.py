@@ -111,7 +111,11 @@ class Aligned:
 def level_of(grey: Float, mask: Mask | None = None) -> Level:
     """Prepare a grey photo as a level; `mask` (H, W) marks valid pixels, None means all."""
     soft = blurred(grey)
-    return Level(soft, *gradient(soft), np.ones(grey.shape, bool) if mask is None else mask)
+    return Level(
+        soft,
+        *gradient(soft),
+        np.ones(grey.shape, bool) if mask is None else mask,
+    )
 
 
 def shot_of(out: Rendered, config: RegisterConfig) -> Shot:
@@ -120,14 +124,23 @@ def shot_of(out: Rendered, config: RegisterConfig) -> Shot:
 
 
 def normal_equations(
-    photo: Level, shot: Shot, K: Float, gain: float, bias: float, scale: float | None = None
+    photo: Level,
+    shot: Shot,
+    K: Float,
+    gain: float,
+    bias: float,
+    scale: float | None = None,
 ) -> Normal:
     """Compute the weighted normal equations of one step, and the cost before it.
 
     `scale` is σ of the residuals; None estimates it. Results do not depend on the number of threads.
     """
     matrix, target, *rest = _core.normal_equations(photo, shot, _list_lens(K), (gain, bias), scale)
-    return Normal(np.array(matrix), np.array(target), *rest)
+    return Normal(
+        np.array(matrix),
+        np.array(target),
+        *rest,
+    )
 
 
 def moves(shot: Shot, K: Float, xi: Float) -> float:
@@ -138,7 +151,16 @@ def moves(shot: Shot, K: Float, xi: Float) -> float:
 def zoomed(camera: Camera, zoom: float, viewmat: Float) -> Camera:
     """Return the camera at a pose with its focal lengths multiplied by `zoom`."""
     return replace(
-        camera, K=camera.K * np.array([[zoom, 1, 1], [1, zoom, 1], [1, 1, 1]]), viewmat=viewmat
+        camera,
+        K=camera.K
+        * np.array(
+            [
+                [zoom, 1, 1],
+                [1, zoom, 1],
+                [1, 1, 1],
+            ]
+        ),
+        viewmat=viewmat,
     )
 
 
@@ -178,7 +200,16 @@ def align(
     The pyramid's cameras state size and given K of each level; their poses are ignored. `focal_sigma` is that
     of the config by default.
     """
-    state = Aligned(np.asarray(start, np.float64), 1.0, 0.0, None, 0.0, 0, 0.0, zoom)
+    state = Aligned(
+        viewmat=np.asarray(start, np.float64),
+        gain=1.0,
+        bias=0.0,
+        covariance=None,
+        overlap=0.0,
+        steps=0,
+        depth=0.0,
+        zoom=zoom,
+    )
     if focal_sigma is not None:
         return _align_levels(renderer, state, pyramid, config, focal_sigma)
     prior = config.focal_sigma
@@ -201,7 +232,10 @@ def _align_levels(
 ) -> Aligned | None:
     for number, (camera, photo) in enumerate(pyramid):
         last = number == len(pyramid) - 1
-        still = config.still if last else _COARSE_STILL_FACTOR * config.still
+        if last:
+            still = config.still
+        else:
+            still = _COARSE_STILL_FACTOR * config.still
         aligned = _align_level(
             renderer, state, camera, photo, config, prior, still, fresh=number == 0
         )
@@ -285,25 +319,36 @@ def _align_level(
         light = lit
         if still:
             break
+    last_camera, shot = view
     final = equations(view, light)
     covariance = inverse(final.matrix)
-    plain = normal_equations(photo, view[1], view[0].K, *light)
+    if covariance is not None:
+        covariance = covariance[:7, :7] * (final.scale**2 * config.correlated)
+    plain = normal_equations(photo, shot, last_camera.K, *light)
     variance = plain.scale**2 * config.correlated
-    counted = photo.mask & view[1].mask
+    counted = photo.mask & shot.mask
     return Aligned(
         pose,
         *light,
-        None if covariance is None else covariance[:7, :7] * (final.scale**2 * config.correlated),
+        covariance,
         float(counted.mean()),
         taken,
-        float(np.median(view[1].depth[counted])),
+        float(np.median(shot.depth[counted])),
         zoom,
-        focal_alone(plain.matrix / variance, plain.right / variance, zoom),
+        focal_alone(
+            plain.matrix / variance,
+            plain.right / variance,
+            zoom,
+        ),
     )
 
 
 def with_prior(
-    normal: Normal, pixels: int, zoom: float, sigma: float, config: RegisterConfig
+    normal: Normal,
+    pixels: int,
+    zoom: float,
+    sigma: float,
+    config: RegisterConfig,
 ) -> Normal:
     """Add the prior of the logarithm of the focal length, `zoom` ~ N(0, `sigma`²), to equations and cost."""
     weight = normal.scale**2 * config.correlated / sigma**2
@@ -321,7 +366,10 @@ def _match_light(photo: Level, shot: Shot) -> tuple[float, float]:
     a = shot.grey[mask]
     b = photo.grey[mask]
     spread = float(a.std())
-    gain = float(np.clip(b.std() / spread, 0.1, 10)) if spread > 1e-6 else 1.0
+    if spread > 1e-6:
+        gain = float(np.clip(b.std() / spread, 0.1, 10))
+    else:
+        gain = 1.0
     return gain, float(b.mean() - gain * a.mean())
 
 

@@ -27,7 +27,12 @@ def small_render(renderer: Renderer, camera: Camera, config: RegisterConfig) -> 
     return np.where(out.alpha >= config.min_alpha, grey, 0.0)
 
 
-def turned(viewmat: Float, render: Float, photo: Float, K: Float) -> tuple[Float, float, float]:
+def turned(
+    viewmat: Float,
+    render: Float,
+    photo: Float,
+    K: Float,
+) -> tuple[Float, float, float]:
     """Rotate a pose by the shift s of its `small_render` onto the photo's band-passed grey, with K of both:
     ω = (−s_v/f_y, s_u/f_x, 0).
 
@@ -44,7 +49,11 @@ class PoolRenders:
     """Renders of a pool's poses with a photo's intrinsics, cached per intrinsics."""
 
     def __init__(
-        self, renderer: Renderer, pool: Cameras, config: RegisterConfig, progress: Progress = silent
+        self,
+        renderer: Renderer,
+        pool: Cameras,
+        config: RegisterConfig,
+        progress: Progress = silent,
     ) -> None:
         self._renderer = renderer
         self.pool = pool
@@ -60,18 +69,23 @@ class PoolRenders:
         key = camera.K.tobytes() + bytes(str((camera.width, camera.height)), "ascii")
         renders = 0
         if key not in self._kept:
-            self._kept[key], renders = [], len(self.pool)
+            renders = len(self.pool)
+            drawn: list[Float] = []
+            self._kept[key] = drawn
             for view in self.pool.viewmats:
-                drawn = small_render(self._renderer, replace(camera, viewmat=view), self._config)
-                self._kept[key].append(drawn)
-                self._progress("pool", len(self._kept[key]), renders)
+                drawn.append(
+                    small_render(self._renderer, replace(camera, viewmat=view), self._config)
+                )
+                self._progress("pool", len(drawn), renders)
         photo = band_passed(grey)
-        similar = [
-            turned(view, render, photo, camera.K)
-            for view, render in zip(self.pool.viewmats, self._kept[key], strict=True)
-        ]
-        order = np.argsort([-likeness for _, likeness, _ in similar], kind="stable").tolist()
-        return [(at, similar[at][0]) for at in order], renders
+        poses = []
+        likenesses = []
+        for view, render in zip(self.pool.viewmats, self._kept[key], strict=True):
+            pose, likeness, _ = turned(view, render, photo, camera.K)
+            poses.append(pose)
+            likenesses.append(-likeness)
+        order = np.argsort(likenesses, kind="stable").tolist()
+        return [(at, poses[at]) for at in order], renders
 
 
 _REPEAT_ROUNDS = 3
@@ -136,7 +150,10 @@ class Candidate:
 
 
 def loaded(
-    cameras: Cameras, index: int, config: RegisterConfig, background: Sequence[float]
+    cameras: Cameras,
+    index: int,
+    config: RegisterConfig,
+    background: Sequence[float],
 ) -> Photo:
     """Read a photo, composited over the background and grey outside of its mask, and shrink it to each size.
 
@@ -146,19 +163,25 @@ def loaded(
     sizes = config.levels()
     one = cameras.take([index]).resized(max(config.size, sizes[-1]))
     image, mask = load_photo(one, 0, background)
-    everywhere = np.ones(image.shape[:2], bool) if mask is None else mask
-    image[~everywhere] = 0.5
-    planes = np.stack([grey_of(image), everywhere], 2).astype(np.float32)
+    if mask is None:
+        mask = np.ones(image.shape[:2], bool)
+    image[~mask] = 0.5
+    planes = np.stack([grey_of(image), mask], 2).astype(np.float32)
     levels = [_shrink(one, planes, sizes[-1])]
     for side in reversed(sizes[:-1]):  # each level from the previous one, which is fastest
         levels.insert(0, _shrink(one, levels[0][1], side))
     pyramid = [
         (camera, level_of(_take_grey(planes), planes[..., 1] > 0.999)) for camera, planes in levels
     ]
-    finest = levels[-1][1]
+    _, finest = levels[-1]
     camera, small = _shrink(one, finest, config.pool_size)
     return Photo(
-        one[0], image, everywhere, pyramid, (camera, _take_grey(small)), _take_grey(finest)
+        camera=one[0],
+        image=image,
+        mask=mask,
+        pyramid=pyramid,
+        small=(camera, _take_grey(small)),
+        whole=_take_grey(finest),
     )
 
 
@@ -184,7 +207,12 @@ class Search:
         match: a matcher; None means direct alignment only.
     """
 
-    def __init__(self, renderer: Renderer, config: RegisterConfig, match: Matcher | None) -> None:
+    def __init__(
+        self,
+        renderer: Renderer,
+        config: RegisterConfig,
+        match: Matcher | None,
+    ) -> None:
         self.renderer = renderer
         self.config = config
         self.match = match
@@ -203,9 +231,16 @@ class Search:
     def by_features(self, start: Start, photo: Photo) -> Candidate | None:
         """Match, solve PnP and refine; return None without a matcher or with too few inliers."""
         solved = self.by_matches(start.begins, photo, self.config.passes)
-        return None if solved is None else self._refined(start, solved, photo)
+        if solved is None:
+            return None
+        return self._refined(start, solved, photo)
 
-    def by_matches(self, pose: Float, photo: Photo, passes: int) -> Solved | None:
+    def by_matches(
+        self,
+        pose: Float,
+        photo: Photo,
+        passes: int,
+    ) -> Solved | None:
         """Match a photo with up to `passes` renders, the first from `pose`, and solve PnP.
 
         None without a matcher or with fewer than `min_inliers` inliers.
@@ -251,7 +286,10 @@ class Search:
         poses = repeated_poses(self.renderer, here, self._sift, config)
         if not poses:
             return best, [], False
-        focal_sigma = best.solved.focal_sigma if best.solved else config.focal_sigma
+        if best.solved:
+            focal_sigma = best.solved.focal_sigma
+        else:
+            focal_sigma = config.focal_sigma
         quick = replace(config, iterations=min(config.iterations, _REPEATED_ITERATIONS))
         aligned = [best]
         for pose in poses:
@@ -274,7 +312,13 @@ class Search:
         self.renders += len(looks)
 
         def compared(a: int, b: int) -> float:
-            return preference(image, level.mask, looks[a], looks[b], config)
+            return preference(
+                image,
+                level.mask,
+                looks[a],
+                looks[b],
+                config,
+            )
 
         first = 0
         for other in range(1, len(aligned)):
@@ -330,7 +374,10 @@ class Search:
             )
         if refine == "auto" and near.covariance is not None:
             of_light = inverse(near.covariance)
-            both = None if of_light is None else inverse(solved.information + of_light)
+            if of_light is None:
+                both = None
+            else:
+                both = inverse(solved.information + of_light)
             if of_light is not None and both is not None:
                 xi = [
                     *motion_between(solved.viewmat, near.viewmat),
@@ -353,7 +400,14 @@ class Search:
         focal_sigma: float | None = None,
         config: RegisterConfig | None = None,
     ) -> Aligned | None:
-        aligned = align(self.renderer, pose, levels, config or self.config, zoom, focal_sigma)
+        aligned = align(
+            self.renderer,
+            pose,
+            levels,
+            config or self.config,
+            zoom,
+            focal_sigma,
+        )
         self.renders += 1 if aligned is None else aligned.steps
         return aligned
 
@@ -363,4 +417,9 @@ class Search:
         out = self.renderer.render(zoomed(camera, found.zoom, found.viewmat))
         self.renders += 1
         mask = level.mask & (out.alpha >= self.config.min_alpha)
-        return local_zncc(grey_of(np.clip(out.image, 0, 1)), photo.whole, mask, self.config.window)
+        return local_zncc(
+            grey_of(np.clip(out.image, 0, 1)),
+            photo.whole,
+            mask,
+            self.config.window,
+        )

@@ -14,13 +14,16 @@ _BAND_WINDOW = 9
 def grey_of(image: Values) -> Float:
     """Return the (H, W) float64 luma of an (H, W, 3) image, .299 R + .587 G + .114 B."""
     rgb = np.asarray(image, np.float64)
-    return rgb[..., 0] * _LUMA[0] + rgb[..., 1] * _LUMA[1] + rgb[..., 2] * _LUMA[2]
+    red, green, blue = _LUMA
+    return rgb[..., 0] * red + rgb[..., 1] * green + rgb[..., 2] * blue
 
 
 def blurred(image: Float) -> Float:
     """Blur by the binomial (1, 4, 6, 4, 1)/16 along both axes (σ = 1 pixel), repeating edges."""
     for axis in (0, 1):
-        pad = np.pad(image, [(2, 2) if i == axis else (0, 0) for i in (0, 1)], mode="edge")
+        width = [(0, 0), (0, 0)]
+        width[axis] = (2, 2)
+        pad = np.pad(image, width, mode="edge")
         n = image.shape[axis]
         a, b, c, d, e = (pad.take(np.arange(k, k + n), axis) for k in range(5))
         image = ((a + e) + 4 * (b + d) + 6 * c) / 16
@@ -34,14 +37,18 @@ def gradient(image: Float) -> tuple[Float, Float]:
 
 def box_mean(image: Float, side: int) -> Float:
     """Return means over the `side`×`side` windows inside an (H, W) image, as (H−side+1, W−side+1)."""
-    sums = np.pad(np.cumsum(np.cumsum(image, 0), 1), ((1, 0), (1, 0)))
-    whole = sums[side:, side:] - sums[:-side, side:] - sums[side:, :-side] + sums[:-side, :-side]
+    sums = np.cumsum(np.cumsum(image, 0), 1)
+    sums = np.pad(sums, ((1, 0), (1, 0)))
+    whole = sums[side:, side:] - sums[:-side, side:]
+    whole -= sums[side:, :-side]
+    whole += sums[:-side, :-side]
     return whole / (side * side)
 
 
 def band_passed(image: Float) -> Float:
     """Return the (H, W) blurred image minus its local mean, which suppresses lighting and noise."""
-    return blurred(image) - box_mean(np.pad(image, _BAND_WINDOW // 2, mode="edge"), _BAND_WINDOW)
+    padded = np.pad(image, _BAND_WINDOW // 2, mode="edge")
+    return blurred(image) - box_mean(padded, _BAND_WINDOW)
 
 
 def zncc(a: Float, b: Float, mask: Mask) -> float:
@@ -56,7 +63,9 @@ def zncc(a: Float, b: Float, mask: Mask) -> float:
     x = x - x.mean()
     y = y - y.mean()
     scale = np.sqrt((x * x).sum() * (y * y).sum())
-    return float((x * y).sum() / scale) if scale > 1e-12 else 0.0
+    if scale > 1e-12:
+        return float((x * y).sum() / scale)
+    return 0.0
 
 
 def shift_between(a: Float, b: Float) -> tuple[int, int, float]:
@@ -71,13 +80,15 @@ def shift_between(a: Float, b: Float) -> tuple[int, int, float]:
     scale = np.sqrt((a * a).sum() * (b * b).sum())
     if not scale > 1e-12:
         return 0, 0, 0.0
-    shape = (2 * height, 2 * width)
-    product = np.fft.irfft2(np.fft.rfft2(b, shape) * np.conj(np.fft.rfft2(a, shape)), shape)
+    padded = (2 * height, 2 * width)
+    spectrum = np.fft.rfft2(b, padded) * np.conj(np.fft.rfft2(a, padded))
+    product = np.fft.irfft2(spectrum, padded)
     down = np.arange(-(height // 2), height // 2 + 1)
     right = np.arange(-(width // 2), width // 2 + 1)
     near = product[np.ix_(down, right)]
-    at = np.unravel_index(int(np.argmax(near)), near.shape)
-    return int(right[at[1]]), int(down[at[0]]), float(near[at] / scale)
+    row, column = np.unravel_index(int(np.argmax(near)), near.shape)
+    likeness = near[row, column] / scale
+    return int(right[column]), int(down[row]), float(likeness)
 
 
 def local_zncc(a: Float, b: Float, mask: Mask, side: int) -> float:

@@ -60,16 +60,19 @@ def matcher_named(name: str, ratio: float, most: int) -> Matcher | None:
             parameter="matcher",
             hint="pip install pycolmap",
         )
-    return Sift(ratio, most) if name in ("auto", "sift") else _load_plugin(name)
+    if name in ("auto", "sift"):
+        return Sift(ratio, most)
+    return _load_plugin(name)
 
 
 def _explain_unusable() -> str:
     """Return why pycolmap is unavailable, or ""."""
     if sys.modules.get("pycolmap", ...) is None or find_spec("pycolmap") is None:
         where = (sys.platform, platform.machine())
-        no_wheel = (
-            "" if where in _PYCOLMAP_PLATFORMS else f", and has no wheel for {' '.join(where)}"
-        )
+        if where in _PYCOLMAP_PLATFORMS:
+            no_wheel = ""
+        else:
+            no_wheel = f", and has no wheel for {' '.join(where)}"
         return f"pycolmap is not installed{no_wheel}"
     try:
         importlib.import_module("pycolmap")
@@ -106,6 +109,13 @@ def _describe(error: BaseException) -> str:
     return " ".join(f"{type(error).__name__}: {error}".split())
 
 
+def _as_array(points: Any) -> Float:
+    array = np.asarray(points, np.float64)
+    if len(points) == 0:
+        return array.reshape(-1, 2)
+    return array
+
+
 def checked_pairs(what: str, pairs: Any, *shapes: tuple[int, ...]) -> Pairs:
     """Validate a matcher's result and return two (M, 2) float64 arrays.
 
@@ -121,8 +131,7 @@ def checked_pairs(what: str, pairs: Any, *shapes: tuple[int, ...]) -> Pairs:
     if isinstance(pairs, tuple | list) and len(pairs) > 2:
         pairs = pairs[:2]
     try:
-        a, b = (np.asarray(points, np.float64).reshape(-1, 2) if len(points) == 0 else
-                np.asarray(points, np.float64) for points in pairs)  # fmt: skip
+        a, b = (_as_array(points) for points in pairs)
     except (TypeError, ValueError):
         raise InputError(f"{expected}, got {type(pairs).__name__}") from None
     if a.ndim != 2 or a.shape[1:] != (2,) or a.shape != b.shape:
@@ -131,7 +140,9 @@ def checked_pairs(what: str, pairs: Any, *shapes: tuple[int, ...]) -> Pairs:
         raise InputError(f"{expected}, got values that are not finite")
     within = np.ones(len(a), bool)
     for points, (height, width, *_) in zip((a, b), shapes, strict=True):
-        within &= ((points >= 0) & (points <= [width, height])).all(1)
+        inside = points >= 0
+        inside &= points <= [width, height]
+        within &= inside.all(1)
     if len(a) and not within.any():
         sizes = " and ".join(f"{width}×{height}" for height, width, *_ in shapes)
         raise InputError(
@@ -170,7 +181,8 @@ class Sift:
     def __call__(self, photo: Float32, render: Float32) -> Pairs:
         if self._kept is None or self._kept[0] is not photo:
             self._kept = photo, self.features(photo)
-        (a, of_a), (b, of_b) = self._kept[1], self.features(render)
+        a, of_a = self._kept[1]
+        b, of_b = self.features(render)
         i, j = mutual(of_a, of_b, self._ratio)
         return a[i], b[j]
 
@@ -178,7 +190,10 @@ class Sift:
         """Return (M, 2) positions and (M, 128) integer-valued descriptors."""
         grey = np.clip(grey_of(image) * 255 + 0.5, 0, 255).astype(np.uint8)
         doubled, whole = self._extractors
-        extractor = doubled if max(grey.shape) <= _UPSAMPLED_SIDE else whole
+        if max(grey.shape) <= _UPSAMPLED_SIDE:
+            extractor = doubled
+        else:
+            extractor = whole
         keypoints, descriptors = extractor.extract_from_uint8_array(np.ascontiguousarray(grey))
         places = np.array([(point.x, point.y) for point in keypoints], np.float64).reshape(-1, 2)
         return places, descriptors.data.astype(np.float32)
@@ -196,11 +211,13 @@ def mutual(a: Float32, b: Float32, ratio: float) -> tuple[Int, Int]:
     """
     if not len(a) or not len(b):
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
-    squares = (a * a).sum(1)[:, None] + (b * b).sum(1)[None, :] - 2 * (a @ b.T)
+    squares = (a * a).sum(1)[:, None] + (b * b).sum(1)[None, :]
+    squares -= 2 * (a @ b.T)
     nearest = squares.argmin(1)
     back = squares.argmin(0)
     rows = np.arange(len(a))
     least = squares[rows, nearest].copy()
     squares[rows, nearest] = np.inf
-    good = (back[nearest] == rows) & (least < ratio**2 * squares.min(1))
+    good = back[nearest] == rows
+    good &= least < ratio**2 * squares.min(1)
     return rows[good], nearest[good]

@@ -79,7 +79,10 @@ def register(
             "no photo has a starting pose; pass starting poses or a pool", parameter="starts"
         )
     renderer = Renderer(scene, background=background)
-    renders = None if pool is None else PoolRenders(renderer, pool, config, progress)
+    if pool is None:
+        renders = None
+    else:
+        renders = PoolRenders(renderer, pool, config, progress)
     search = Search(renderer, config, matcher_named(config.matcher, config.ratio, config.features))
     rows = []
     kept = []
@@ -89,7 +92,10 @@ def register(
     for i, name in enumerate(photos.names):
         progress("register", i, len(photos))
         began = time.perf_counter()
-        start = Start(given[name], given[name], name) if name in given else None
+        if name in given:
+            start = Start(given[name], given[name], name)
+        else:
+            start = None
         row, best = _register_photo(search, photos, i, start, renders)
         if best is not None and best.solved is not None:
             matches[name] = np.concatenate([best.solved.pixels, best.solved.seen], 1)
@@ -167,17 +173,25 @@ def _start_from_pose(search: Search, given: Start, photo: Photo) -> list[Candida
     def accepted(found: list[Candidate]) -> bool:
         return any(c.zncc >= config.accept for c in found)
 
-    out = [c] if (c := search.by_features(given, photo)) else []
+    out = []
+    by_features = search.by_features(given, photo)
+    if by_features:
+        out.append(by_features)
     if accepted(out) or not config.fallback:
         return out
-    aligned = [c] if (c := search.by_alignment(given, photo)) else []
+    aligned = []
+    by_alignment = search.by_alignment(given, photo)
+    if by_alignment:
+        aligned.append(by_alignment)
     if not accepted(aligned):
         camera, grey = photo.small
         render = small_render(search.renderer, replace(camera, viewmat=given.pose), config)
         pose, _, shift = turned(given.pose, render, band_passed(grey), camera.K)
         search.renders += 1
-        if shift and (c := search.by_alignment(replace(given, begins=pose), photo)):
-            aligned.append(c)
+        if shift:
+            again = search.by_alignment(replace(given, begins=pose), photo)
+            if again:
+                aligned.append(again)
     return out + aligned + _try_features(search, aligned, photo)
 
 
@@ -189,14 +203,21 @@ def _start_from_pool(search: Search, pool: PoolRenders, photo: Photo) -> list[Ca
         Start(pool.pool.viewmats[at], pose, pool.pool.names[at], rank)
         for rank, (at, pose) in enumerate(order[: search.config.candidates], 1)
     ]
-    first = [(s, start) for start in starts if (s := search.by_matches(start.begins, photo, 1))]
-    if first:
-        solved, start = max(first, key=lambda each: each[0].inliers)
-        if c := search.by_features(replace(start, begins=solved.viewmat), photo):
-            return [c]
+    best = None
+    most = 0
+    for start in starts:
+        solved = search.by_matches(start.begins, photo, 1)
+        if solved and solved.inliers > most:
+            best = replace(start, begins=solved.viewmat)
+            most = solved.inliers
+    if best:
+        found = search.by_features(best, photo)
+        if found:
+            return [found]
     if not search.config.fallback:
         return []
-    aligned = [c for start in starts if (c := search.by_alignment(start, photo))]
+    attempts = [search.by_alignment(start, photo) for start in starts]
+    aligned = [candidate for candidate in attempts if candidate]
     return aligned + _try_features(search, aligned, photo)
 
 
@@ -220,7 +241,10 @@ def _report(
     estimate = best.found
     sigma = None
     covariance = None
-    prior = best.solved.focal_sigma if best.solved else config.focal_sigma
+    if best.solved:
+        prior = best.solved.focal_sigma
+    else:
+        prior = config.focal_sigma
     if estimate.covariance is not None:
         motions = [motion_between(estimate.viewmat, other) for other in alike]
         covariance = _add_tail(estimate.covariance, prior)[:6, :6] + sum(
@@ -267,7 +291,10 @@ def _add_tail(covariance: Float, prior: float) -> Float:
 
 
 def _judge(
-    zncc: float, sigma: PoseError | None, depth: float, config: RegisterConfig
+    zncc: float,
+    sigma: PoseError | None,
+    depth: float,
+    config: RegisterConfig,
 ) -> tuple[Status, str | None]:
     """Return the status of a pose and the reason, None if it is registered."""
     if sigma is None:

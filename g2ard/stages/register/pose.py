@@ -24,11 +24,15 @@ def moved(viewmat: Float, xi: ArrayLike) -> Float:
     The translation of exp(ξ) is V·v with V = I + (1 − cos θ)/θ² [ω]ₓ + (θ − sin θ)/θ³ [ω]ₓ². The rotation is
     re-orthogonalised, so that rounding does not accumulate.
     """
-    v = np.asarray(xi, np.float64)[:3]
-    omega = np.asarray(xi, np.float64)[3:]
+    xi = np.asarray(xi, np.float64)
+    v = xi[:3]
+    omega = xi[3:]
     cross, first, second = _rodrigues(omega)
     angle2 = float(omega @ omega)
-    third = (1 - first) / angle2 if angle2 > 1e-8 else 1 / 6
+    if angle2 > 1e-8:
+        third = (1 - first) / angle2
+    else:
+        third = 1 / 6
     square = cross @ cross
     R = np.eye(3) + first * cross + second * square
     V = np.eye(3) + second * cross + third * square
@@ -42,11 +46,14 @@ def moved(viewmat: Float, xi: ArrayLike) -> Float:
 def motion_between(first: Float, second: Float) -> Float:
     """Return ξ = (v, ω), (6,), with exp(ξ)·first = second, for rotations below 180°."""
     R = second[:3, :3] @ first[:3, :3].T
-    axis = np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]]) / 2
+    axis = _skew_axis(R) / 2
     length = float(np.linalg.norm(axis))
     angle = float(np.arctan2(length, (np.trace(R) - 1) / 2))
-    omega = axis * (angle / length if length > 1e-9 else 1.0)
-    V = np.stack([moved(np.eye(4), [*unit, *omega])[:3, 3] for unit in np.eye(3)], 1)
+    omega = axis
+    if length > 1e-9:
+        omega = axis * (angle / length)
+    columns = [moved(np.eye(4), [*unit, *omega])[:3, 3] for unit in np.eye(3)]
+    V = np.stack(columns, 1)
     v = np.linalg.solve(V, second[:3, 3] - R @ first[:3, 3])
     return np.concatenate([v, omega])
 
@@ -57,19 +64,39 @@ def pose_error(found: Float, true: Float) -> tuple[float, float]:
     The angle of the (4, 4) camera_from_world is atan2(|axis|, trace − 1): the arc cosine of the trace loses
     small angles to rounding.
     """
-    centres = [-T[:3, :3].T @ T[:3, 3] for T in (found, true)]
+    found_centre, true_centre = (-T[:3, :3].T @ T[:3, 3] for T in (found, true))
     R = found[:3, :3] @ true[:3, :3].T
-    axis = [R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]]
-    angle = np.degrees(np.arctan2(np.linalg.norm(axis), np.trace(R) - 1))
-    return float(np.linalg.norm(centres[0] - centres[1])), float(angle)
+    sine = np.linalg.norm(_skew_axis(R))
+    angle = np.degrees(np.arctan2(sine, np.trace(R) - 1))
+    away = np.linalg.norm(found_centre - true_centre)
+    return float(away), float(angle)
+
+
+def _skew_axis(R: Float) -> Float:
+    """Return the (3,) axis of a rotation, times 2 sin θ."""
+    return np.array(
+        [
+            R[2, 1] - R[1, 2],
+            R[0, 2] - R[2, 0],
+            R[1, 0] - R[0, 1],
+        ]
+    )
 
 
 def _rodrigues(omega: ArrayLike) -> tuple[Float, float, float]:
     """Return [ω]ₓ and Rodrigues' coefficients sin θ/θ and (1 − cos θ)/θ², by series for small θ."""
     x, y, z = np.asarray(omega, np.float64)
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    cross = np.array(
+        [
+            [0, -z, y],
+            [z, 0, -x],
+            [-y, x, 0],
+        ]
+    )
     angle2 = x * x + y * y + z * z
     if angle2 < 1e-8:
         return cross, 1 - angle2 / 6, 0.5 - angle2 / 24
     angle = np.sqrt(angle2)
-    return cross, float(np.sin(angle) / angle), float((1 - np.cos(angle)) / angle2)
+    first = np.sin(angle) / angle
+    second = (1 - np.cos(angle)) / angle2
+    return cross, float(first), float(second)

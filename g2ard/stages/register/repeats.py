@@ -25,7 +25,7 @@ import numpy as np
 from g2ard.arrays import Float, Float32, Mask, Rows
 from g2ard.io.images import resize
 from g2ard.rendering.renderer import Rendered, Renderer
-from g2ard.scene.cameras import Camera
+from g2ard.scene.cameras import Camera, within_frame
 from g2ard.stages.register.config import RegisterConfig
 from g2ard.stages.register.grey import band_passed, blurred, box_mean, grey_of, zncc
 from g2ard.stages.register.matchers import Sift
@@ -87,7 +87,10 @@ class Look(NamedTuple):
 def look(renderer: Renderer, camera: Camera, config: RegisterConfig) -> Look:
     """Render a `Look`."""
     out = renderer.render(camera)
-    return Look(softened(np.clip(out.image, 0, 1)), out.alpha >= config.min_alpha)
+    return Look(
+        softened(np.clip(out.image, 0, 1)),
+        out.alpha >= config.min_alpha,
+    )
 
 
 def softened(image: Float32) -> Float:
@@ -96,7 +99,10 @@ def softened(image: Float32) -> Float:
 
 
 def repeated_poses(
-    renderer: Renderer, camera: Camera, sift: Sift, config: RegisterConfig
+    renderer: Renderer,
+    camera: Camera,
+    sift: Sift,
+    config: RegisterConfig,
 ) -> list[Float]:
     """Return at most `_MOST_REPEATS` poses whose renders look like the one of `camera`, most alike first."""
     out = renderer.render(camera, median=True)
@@ -112,7 +118,9 @@ def repeated_poses(
     side = max(camera.width, camera.height)
     squares = 2 - 2 * descriptors @ descriptors.T  # of the descriptors' distances
     apart = np.hypot(*(np.subtract.outer(axis, axis) for axis in places.T))
-    i, j = np.nonzero((squares < _LIKE) & (apart > _LEAST_SHIFT * side))
+    alike = squares < _LIKE
+    alike &= apart > _LEAST_SHIFT * side
+    i, j = np.nonzero(alike)
     stride = 1 + len(i) // _MOST_PAIRS
     i = i[::stride]
     j = j[::stride]
@@ -126,7 +134,8 @@ def repeated_poses(
         poses.append(camera.viewmat @ back)
     for one in _find_common(shifts / (_PIXEL_CELL * side), least, _MOST_PIXEL_PEAKS):
         few = one[:: 1 + len(one) // _MOST_MATCHES]
-        answer = solve_pnp(camera, places[i[few]], points[j[few]], config)
+        pixels = places[i[few]]
+        answer = solve_pnp(camera, pixels, points[j[few]], config)
         if answer is not None and answer[1].sum() >= _LEAST_SUPPORT:
             poses.append(answer[0])
     resemblance = _Resemblance(out, camera, config)
@@ -164,12 +173,18 @@ def _find_common(steps: Float, least: int, most: int) -> Iterator[Rows]:
 class _Resemblance:
     """Likeness of a render to itself seen from other poses, by moving its own pixels; ignores occlusion."""
 
-    def __init__(self, out: Rendered, camera: Camera, config: RegisterConfig) -> None:
+    def __init__(
+        self,
+        out: Rendered,
+        camera: Camera,
+        config: RegisterConfig,
+    ) -> None:
         share = min(1.0, _SELF_SIDE / max(camera.width, camera.height))
         width = round(camera.width * share)
         height = round(camera.height * share)
-        planes = np.dstack([grey_of(np.clip(out.image, 0, 1)), out.alpha >= config.min_alpha])
-        small = resize(planes.astype(np.float32), (width, height)).astype(np.float64)
+        grey = grey_of(np.clip(out.image, 0, 1))
+        planes = np.dstack([grey, out.alpha >= config.min_alpha]).astype(np.float32)
+        small = resize(planes, (width, height)).astype(np.float64)
         self._size = width, height
         self._grey = band_passed(small[..., 0])
         self._mask = small[..., 1] > 0.999
@@ -179,9 +194,9 @@ class _Resemblance:
         at = (np.stack([u, v], 1) + 0.5) / self._scale  # in pixels of the camera
         column, row = at.astype(int).T
         depth = out.depth[row, column].astype(np.float64)
-        K = camera.K
-        x = (at[:, 0] - K[0, 2]) / K[0, 0]
-        y = (at[:, 1] - K[1, 2]) / K[1, 1]
+        (fx, _, cx), (_, fy, cy), _ = camera.K
+        x = (at[:, 0] - cx) / fx
+        y = (at[:, 1] - cy) / fy
         rays = np.stack([x, y, np.ones(len(at))], 1)
         self._seen = rays * depth[:, None]
         self._here = self._grey[v, u]
@@ -194,9 +209,9 @@ class _Resemblance:
         depth = np.where(ahead, moved[:, 2], 1)
         K = self._camera.K
         pixels = moved[:, :2] / depth[:, None] * [K[0, 0], K[1, 1]] + K[:2, 2]
-        column, row = np.floor(np.clip(pixels * self._scale, -1, 1e6)).astype(int).T
-        width, height = self._size
-        inside = ahead & (column >= 0) & (row >= 0) & (column < width) & (row < height)
+        pixels = np.clip(pixels * self._scale, -1, 1e6)
+        column, row = np.floor(pixels).astype(int).T
+        inside = ahead & within_frame(column, row, *self._size)
         inside[inside] = self._mask[row[inside], column[inside]]
         share = float(inside.sum()) / max(1, len(inside))
         if share < _LEAST_COMPARED:
@@ -208,7 +223,13 @@ class _Resemblance:
         return likeness * float(np.sqrt(share))
 
 
-def preference(photo: Float, mask: Mask, a: Look, b: Look, config: RegisterConfig) -> float:
+def preference(
+    photo: Float,
+    mask: Mask,
+    a: Look,
+    b: Look,
+    config: RegisterConfig,
+) -> float:
     """Return (λ − ½)/σ: above `DECISIVE`, the photo excludes b, below its negative it excludes a.
 
     Where a render shows nothing, it predicts the photo's mean colour. Gain and bias of each channel are those
@@ -229,12 +250,12 @@ def preference(photo: Float, mask: Mask, a: Look, b: Look, config: RegisterConfi
     gain, bias = _fit_light(mean, seen)
     residual = np.zeros(mask.shape)
     residual[agree] = ((seen - gain * mean - bias) ** 2).sum(1)
-    noise = max(float(residual[agree].mean()) / 3, _LEAST_NOISE**2)
+    variance = float(residual[agree].mean()) / 3
+    noise = max(variance, _LEAST_NOISE**2)
     side = max(1, max(mask.shape) // _THING)
     sums = side * side * box_mean(residual, min(side, *mask.shape))
     thing = float(sums.max() - np.median(sums))
-    first = np.where(a.mask[..., None], gain * a.image + bias, usual)
-    second = np.where(b.mask[..., None], gain * b.image + bias, usual)
+    first, second = (np.where(x.mask[..., None], gain * x.image + bias, usual) for x in (a, b))
     counts = mask & np.where(both, differ, a.mask | b.mask)
     difference = (first - second)[counts]
     energy = float((difference * difference).sum())
@@ -242,7 +263,8 @@ def preference(photo: Float, mask: Mask, a: Look, b: Look, config: RegisterConfi
         return 0.0
     unexplained = photo[counts] - (first + second)[counts] / 2
     share = float((difference * unexplained).sum()) / energy  # λ − ½
-    sigma = np.sqrt(_MODEL_SIGMA**2 + (3 * config.window**2 * noise + thing / 12) / energy)
+    error = 3 * config.window**2 * noise + thing / 12
+    sigma = np.sqrt(_MODEL_SIGMA**2 + error / energy)
     return float(share / sigma)
 
 

@@ -97,12 +97,19 @@ def solve(
         of = uv[known][inlying]
         at = seen[known][inlying]
         X = points[known][inlying]
-        found, prior, data, alone = with_focal(zoomed(there, 1.0, T), camera.K[0, 0], of, X, config)
+        found, prior, data, alone = with_focal(
+            zoomed(there, 1.0, T),
+            camera.K[0, 0],
+            of,
+            X,
+            config,
+        )
         T = found.viewmat
         K = found.K
-        shift = _project(T, K, X) - _project(there.viewmat, there.K, X)
+        pixels = _project(T, K, X)
+        shift = pixels - _project(there.viewmat, there.K, X)
         cells = np.floor(4 * of / [camera.width, camera.height]).clip(0, 3) @ [1, 4]
-        distance = np.linalg.norm(_project(T, K, X) - of, axis=1)
+        distance = np.linalg.norm(pixels - of, axis=1)
         solution = Solved(
             viewmat=T,
             matches=int(known.sum()),
@@ -118,7 +125,7 @@ def solve(
             focal_sigma=prior,
             alone=alone,
         )
-        if float(np.sqrt((shift**2).sum(1).mean())) < _STILL_PIXELS:
+        if np.sqrt((shift**2).sum(1).mean()) < _STILL_PIXELS:
             break
     return solution
 
@@ -129,7 +136,12 @@ def _look_up(image: Mask, uv: Float) -> Mask:
     return image[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)]
 
 
-def lifted(out: Rendered, camera: Camera, uv: Float, config: RegisterConfig) -> tuple[Float, Mask]:
+def lifted(
+    out: Rendered,
+    camera: Camera,
+    uv: Float,
+    config: RegisterConfig,
+) -> tuple[Float, Mask]:
     """Lift render pixels to 3D points.
 
     The median depth is interpolated between the four pixels around (u, v). It is known if all four have a
@@ -139,30 +151,42 @@ def lifted(out: Rendered, camera: Camera, uv: Float, config: RegisterConfig) -> 
     assert out.median is not None
     height, width = out.alpha.shape
     x, y = (uv - 0.5).T
-    left = np.clip(np.floor(x).astype(int), 0, max(width - 2, 0))
-    top = np.clip(np.floor(y).astype(int), 0, max(height - 2, 0))
+    left = np.floor(x).astype(int).clip(0, max(width - 2, 0))
+    top = np.floor(y).astype(int).clip(0, max(height - 2, 0))
     right = np.minimum(left + 1, width - 1)
     down = np.minimum(top + 1, height - 1)
     a = np.clip(x - left, 0, 1)
     b = np.clip(y - top, 0, 1)
-    share = np.stack([(1 - a) * (1 - b), a * (1 - b), (1 - a) * b, a * b])
+    share = np.stack(
+        [
+            (1 - a) * (1 - b),
+            a * (1 - b),
+            (1 - a) * b,
+            a * b,
+        ]
+    )
     cells = (top, left), (top, right), (down, left), (down, right)
     depths = np.stack([out.median[cell].astype(np.float64) for cell in cells])
     alpha = np.stack([out.alpha[cell].astype(np.float64) for cell in cells]).min(0)
     nearest = depths.min(0)
-    z = (share * depths).sum(0)
-    known = (nearest > 0) & (alpha >= config.min_alpha)
+    known = nearest > 0
+    known &= alpha >= config.min_alpha
     known &= depths.max(0) - nearest <= config.max_edge * nearest
-    K = camera.K
-    T = camera.viewmat
-    x = (uv[:, 0] - K[0, 2]) / K[0, 0] * z
-    y = (uv[:, 1] - K[1, 2]) / K[1, 1] * z
+    (fx, _, cx), (_, fy, cy), _ = camera.K
+    z = (share * depths).sum(0)
+    x = (uv[:, 0] - cx) / fx * z
+    y = (uv[:, 1] - cy) / fy * z
     seen = np.stack([x, y, z], 1)
-    return np.einsum("mi,ij->mj", seen - T[:3, 3], T[:3, :3], optimize=False), known
+    rotation = camera.viewmat[:3, :3]
+    from_eye = seen - camera.viewmat[:3, 3]
+    return np.einsum("mi,ij->mj", from_eye, rotation, optimize=False), known
 
 
 def solve_pnp(
-    camera: Camera, uv: Float, points: Float, config: RegisterConfig
+    camera: Camera,
+    uv: Float,
+    points: Float,
+    config: RegisterConfig,
 ) -> tuple[Float, Mask] | None:
     """Solve PnP for (M, 2) pixels of (M, 3) points; return pose and inlier mask, or None with too few."""
     import pycolmap
@@ -199,7 +223,11 @@ def solve_pnp(
 
 
 def with_focal(
-    camera: Camera, given: float, uv: Float, points: Float, config: RegisterConfig
+    camera: Camera,
+    given: float,
+    uv: Float,
+    points: Float,
+    config: RegisterConfig,
 ) -> tuple[Camera, float, Float, tuple[float, float]]:
     """Refine pose and focal length on (M, 2) pixels of (M, 3) points, with a prior at `given` pixels.
 
@@ -213,46 +241,76 @@ def with_focal(
             data, right = information(here.viewmat, here.K, uv, points)
             data = data / config.alike
             right = right / config.alike
-            alone = focal_alone(data, right, here.K[0, 0] / given)
+            zoom = here.K[0, 0] / given
+            alone = focal_alone(data, right, zoom)
             both = data.copy()
             both[6, 6] += 1 / prior**2
-            right[6] -= float(np.log(here.K[0, 0] / given)) / prior**2
+            right[6] -= float(np.log(zoom)) / prior**2
+            # scaled to a unit diagonal, because lengths and angles have different units
             unit = 1 / np.sqrt(np.maximum(np.diag(both), 1e-30))
-            covariance = np.linalg.pinv(both * unit[:, None] * unit) * unit[:, None] * unit
+            scaled = both * unit[:, None] * unit
+            covariance = np.linalg.pinv(scaled) * unit[:, None] * unit
             step = covariance @ right
-            zoom = float(np.exp(np.clip(step[6], -_MOST_ZOOM, _MOST_ZOOM)))
-            here = zoomed(here, zoom, moved(here.viewmat, step[:6]))
+            further = float(np.exp(np.clip(step[6], -_MOST_ZOOM, _MOST_ZOOM)))
+            here = zoomed(here, further, moved(here.viewmat, step[:6]))
             if (np.abs(step) < 1e-3 * np.sqrt(np.diag(covariance))).all():
                 break
         wider = focal_prior(alone, prior)
         if wider == prior:
             break
         prior = wider
-    before = np.median(np.abs(_project(camera.viewmat, camera.K, points) - uv))
-    after = np.median(np.abs(_project(here.viewmat, here.K, points) - uv))
-    if not after < before + config.max_reprojection:  # diverged
+    before = _project(camera.viewmat, camera.K, points) - uv
+    after = _project(here.viewmat, here.K, points) - uv
+    most = np.median(np.abs(before)) + config.max_reprojection
+    if not np.median(np.abs(after)) < most:  # diverged
         data, _ = information(camera.viewmat, camera.K, uv, points)
         return camera, config.focal_sigma, data / config.alike, alone
     return here, prior, data, alone
 
 
-def information(T: Float, K: Float, uv: Float, points: Float) -> tuple[Float, Float]:
+def information(
+    T: Float,
+    K: Float,
+    uv: Float,
+    points: Float,
+) -> tuple[Float, Float]:
     """Return the (7, 7) JᵀWJ/σ² and the (7,) JᵀWr/σ² of r = u − π(exp(ξ) T X) with focal lengths f·exp(φ).
 
     J = (∂π/∂X·[I | −[X]ₓ], (f_x X/Z, f_y Y/Z)). W is Cauchy's weight 1/(1 + r²/σ²), with σ from the median
     absolute deviation of the residuals.
     """
     X = points @ T[:3, :3].T + T[:3, 3]
-    x = X[:, 0] / X[:, 2]
-    y = X[:, 1] / X[:, 2]
     depth = X[:, 2]
+    x = X[:, 0] / depth
+    y = X[:, 1] / depth
     none = np.zeros(len(X))
-    right = np.stack([1 / depth, none, -x / depth, -x * y, 1 + x * x, -y, x]) * K[0, 0]
-    down = np.stack([none, 1 / depth, -y / depth, -1 - y * y, x * y, x, y]) * K[1, 1]
+    right = np.stack(
+        [
+            1 / depth,
+            none,
+            -x / depth,
+            -x * y,
+            1 + x * x,
+            -y,
+            x,
+        ]
+    )
+    down = np.stack(
+        [
+            none,
+            1 / depth,
+            -y / depth,
+            -1 - y * y,
+            x * y,
+            x,
+            y,
+        ]
+    )
+    J = np.concatenate([right * K[0, 0], down * K[1, 1]], 1)
     residual = uv - _project(T, K, points)
-    sigma = max(_LEAST_MATCH_SIGMA, _SIGMA_OF_MAD * float(np.median(np.abs(residual))))
+    deviation = float(np.median(np.abs(residual)))
+    sigma = max(_LEAST_MATCH_SIGMA, _SIGMA_OF_MAD * deviation)
     weight = 1 / (1 + (residual**2).sum(1) / sigma**2)
-    J = np.concatenate([right, down], 1)
     weighted = J * (np.concatenate([weight, weight]) / sigma**2)
     squares = np.einsum("in,jn->ij", weighted, J, optimize=False)
     return squares, weighted @ residual.T.ravel()

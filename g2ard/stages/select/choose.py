@@ -114,8 +114,15 @@ def select(
         gains = poses.gains_of(order, alike, of_usable)
     if not len(order):
         raise InputError(unseeing(cameras, "a cell of the surface"))
-    count = _find_knee(gains) if k == "auto" else min(k, len(order))
-    share = gains / total if (total := gains.sum()) > 0 else np.full(len(gains), 1 / len(gains))
+    if k == "auto":
+        count = _find_knee(gains)
+    else:
+        count = min(k, len(order))
+    total = gains.sum()
+    if total > 0:
+        share = gains / total
+    else:
+        share = np.full(len(gains), 1 / len(gains))
     seconds["total"] = time.perf_counter() - began
     return Selection(
         policy=policy,
@@ -155,4 +162,6 @@ def _find_knee(gains: Float) -> int:
     if not total > 0:
         return len(gains)
     above = np.cumsum(gains) / total - np.arange(1, len(gains) + 1) / len(gains)
-    return int(np.argmax(above)) + 1 if above.max() > _LEAST_CURVE_BEND else len(gains)
+    if above.max() > _LEAST_CURVE_BEND:
+        return int(np.argmax(above)) + 1
+    return len(gains)

@@ -81,7 +81,11 @@ def complete(
 
 
 def _measure_light(
-    scene: Splats, cameras: Cameras, rows: Int, share: float, tell: Callable[[int], None]
+    scene: Splats,
+    cameras: Cameras,
+    rows: Int,
+    share: float,
+    tell: Callable[[int], None],
 ) -> Float32:
     """Return (C, R) min(share·A, 64)/16 for some rows."""
     local, here = centred(scene, cameras.resized(_RENDER_SIDE))

@@ -8,7 +8,7 @@ import g2ard._core as _core
 from g2ard.arrays import Float, Int, Mask
 from g2ard.errors import InputError
 from g2ard.progress import Progress, counter, silent
-from g2ard.scene.cameras import Cameras, unseeing
+from g2ard.scene.cameras import Cameras, unseeing, within_frame
 from g2ard.scene.splats import Splats
 from g2ard.stages.select.surfaces import Surface, core_scene, core_views, surface
 
@@ -75,21 +75,19 @@ def outlooks(cells: Surface, cameras: Cameras) -> tuple[Float, Float]:
     depths = np.zeros(len(local))
     shares = np.zeros(len(local))
     columns, rows = _DEPTH_GRID
-    for i in range(len(local)):
-        width = local.widths[i]
-        height = local.heights[i]
-        K = local.Ks[i]
-        x, y, z = local.viewmats[i, :3, :3] @ cells.centers.T + local.viewmats[i, :3, 3:]
+    for i, view in enumerate(local):
+        x, y, z = view.viewmat[:3, :3] @ cells.centers.T + view.viewmat[:3, 3:]
         ahead = z > 0
         z = np.where(ahead, z, 1.0)
-        u = K[0, 0] * x / z + K[0, 2]
-        v = K[1, 1] * y / z + K[1, 2]
-        inside = ahead & (u >= 0) & (u < width) & (v >= 0) & (v < height)
+        (fx, _, cx), (_, fy, cy), _ = view.K
+        u = fx * x / z + cx
+        v = fy * y / z + cy
+        inside = ahead & within_frame(u, v, view.width, view.height)
         if not inside.any():
             continue
         z = z[inside]
-        row = (v[inside] * rows / height).astype(int)
-        column = (u[inside] * columns / width).astype(int)
+        row = (v[inside] * rows / view.height).astype(int)
+        column = (u[inside] * columns / view.width).astype(int)
         place = row * columns + column
         nearest = np.full(columns * rows, np.inf)
         np.minimum.at(nearest, place, z)
@@ -99,35 +97,48 @@ def outlooks(cells: Surface, cameras: Cameras) -> tuple[Float, Float]:
     return depths, shares
 
 
-def inside_geometry(splats: Splats, cameras: Cameras, depths: Float, progress: Progress) -> Mask:
+def inside_geometry(
+    splats: Splats,
+    cameras: Cameras,
+    depths: Float,
+    progress: Progress,
+) -> Mask:
     """Return a (C,) mask of poses inside geometry; poses of photos are never marked.
 
     `depths` comes from `outlooks`.
     """
     made = np.array([path is None for path in cameras.image_paths])
-    if not (made.any() and (depths > 0).any()):
+    known = depths > 0
+    if not (made.any() and known.any()):
         return np.zeros(len(cameras), bool)
     step = -(-len(splats) // _INSIDE_SAMPLE)
     sample = splats.take(np.arange(0, len(splats), step))
     sample = replace(sample, scales=sample.scales * np.float32(np.sqrt(step)))
     scene, origin = core_scene(sample)
     small = core_views(cameras.resized(_INSIDE_RENDER_SIDE), origin, scene)
-    share, near = _core.select_view_statistics(scene, small, progress=counter(progress, "poses")).T
-    typical = np.median(np.where(near > 0, near, depths)[depths > 0])
-    inside: Mask = made & (share > 0.5) & (near < _INSIDE_DEPTH_SHARE * typical)
+    statistics = _core.select_view_statistics(scene, small, progress=counter(progress, "poses"))
+    share, near = statistics.T
+    typical = np.median(np.where(near > 0, near, depths)[known])
+    inside: Mask = made & (share > 0.5)
+    inside &= near < _INSIDE_DEPTH_SHARE * typical
     return inside
 
 
 def pose_kernel(cameras: Cameras, depths: Float) -> Float:
     """Return (C, C) exp(−(d/0.35)²) with d² = |Δposition|²/(depth·depth) + |Δdirection|²: parallax and
     rotation."""
-    seen = depths[depths > 0]
-    scale = np.where(depths > 0, depths, np.median(seen) if len(seen) else 1.0)
+    known = depths > 0
+    usual = 1.0
+    if known.any():
+        usual = float(np.median(depths[known]))
+    scale = np.where(known, depths, usual)
     # robust to a single far pose
     positions = cameras.positions - np.median(cameras.positions, axis=0)
     with np.errstate(over="ignore", invalid="ignore"):  # squares of 1e300 overflow to infinity
-        away = np.nan_to_num(_measure_squares(positions), nan=np.inf) / (scale[:, None] * scale)
-    return np.exp(-(away + _measure_squares(cameras.forwards)) / _KERNEL_BANDWIDTH**2)
+        away = np.nan_to_num(_measure_squares(positions), nan=np.inf)
+        away = away / (scale[:, None] * scale)
+    away += _measure_squares(cameras.forwards)
+    return np.exp(-away / _KERNEL_BANDWIDTH**2)
 
 
 def _measure_squares(rows: Float) -> Float:
@@ -144,7 +155,12 @@ def inverse_density(alike: Float) -> Float:
     return weights / weights.sum()
 
 
-def facility_location(alike: Float, pose_weights: Float, usable: Mask, shares: Float) -> Int:
+def facility_location(
+    alike: Float,
+    pose_weights: Float,
+    usable: Mask,
+    shares: Float,
+) -> Int:
     """Order views by how well they represent all candidates: reach first, then facility location.
 
     From the weighted medoid, the farthest pose comes next while any pose is more than two bandwidths from all
@@ -183,7 +199,9 @@ def facility_location(alike: Float, pose_weights: Float, usable: Mask, shares: F
 
 def bandwidths_apart(alike: Float) -> Float:
     """Return (C, C) distances in bandwidths of the kernel."""
-    return np.asarray(np.sqrt(-np.log(np.maximum(alike, np.finfo(np.float64).tiny))))
+    tiny = np.finfo(np.float64).tiny
+    exponents = -np.log(np.maximum(alike, tiny))
+    return np.asarray(np.sqrt(exponents))
 
 
 def gains_of(order: Int, alike: Float, pose_weights: Float) -> Float:

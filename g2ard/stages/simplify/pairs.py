@@ -146,20 +146,25 @@ def fit_opacities(
     alpha = scene.opacities.astype(np.float64)
     aimed = alpha * factor
     limited = np.minimum(aimed, np.maximum(alpha, MAX_OPACITY))
-    vanishes = (limited < DRAWN_OPACITY) & (alpha >= DRAWN_OPACITY)
-    kept = (members < 2) | ~np.isfinite(factor) | vanishes | (alpha <= 0)
+    vanishes = limited < DRAWN_OPACITY
+    vanishes &= alpha >= DRAWN_OPACITY
+    kept = vanishes | (members < 2)
+    kept |= ~np.isfinite(factor)
+    kept |= alpha <= 0
     fitted = np.where(kept, alpha, limited)
-    growth = np.where(kept | (fitted <= 0), 1.0, aimed / np.maximum(fitted, 1e-30))
+    growth = aimed / np.maximum(fitted, 1e-30)
+    growth[kept | (fitted <= 0)] = 1.0
     changed = fitted != alpha
     logits = np.log(np.maximum(fitted, 1e-30)) - np.log1p(-np.minimum(fitted, 1 - 1e-9))
-    shortest = np.arange(3) == np.argmin(scene.scales, axis=1)[:, None]
-    grown = (growth > 1)[:, None] & ~shortest
+    logits = np.where(changed, logits, scene.logit_opacities)
+    shortest = np.argmin(scene.scales, axis=1)
+    grown = growth[:, None] > 1
+    grown = grown & (np.arange(3) != shortest[:, None])
+    scales = np.where(grown, scene.scales * np.sqrt(growth)[:, None], scene.scales)
     return replace(
         scene,
-        logit_opacities=np.where(changed, logits, scene.logit_opacities).astype(np.float32),
-        scales=np.where(grown, scene.scales * np.sqrt(growth)[:, None], scene.scales).astype(
-            np.float32
-        ),
+        logit_opacities=logits.astype(np.float32),
+        scales=scales.astype(np.float32),
     )
 
 

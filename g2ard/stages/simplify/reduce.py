@@ -198,7 +198,10 @@ def simplify(
     elif callable(visibility):
         out = merge_and_fit(scene, budget, visibility, protected, config, progress)
     else:
-        seen = None if visibility is None else rows_of(visibility, len(splats), finite)
+        if visibility is None:
+            seen = None
+        else:
+            seen = rows_of(visibility, len(splats), finite)
         out = merge(scene, budget, seen, protected, config, progress)
     views = getattr(visibility, "views", None)
     lost = None
@@ -218,7 +221,9 @@ def _finish(
     small = splats_of(splats, out).with_sh_degree(splats.sh_degree)
     small = replace(small, quats=unit_quats(small.quats))  # unmerged rows keep their quaternions
     kept = int(np.count_nonzero(parents >= 0))
-    alone = int(np.count_nonzero(np.bincount(parents[parents >= 0], minlength=len(small)) == 1))
+    members = np.bincount(parents[parents >= 0], minlength=len(small))
+    alone = int(np.count_nonzero(members == 1))
+    del members
     protected: Mask = out["protected"]
     report = SimplifyReport(
         input_count=len(splats),
