@@ -6,7 +6,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
-from itertools import pairwise
 
 COLORS = (
     "#2563eb",
@@ -77,23 +76,36 @@ def choose_ticks(low: float, high: float, *, log: bool = False) -> list[float]:
         first = math.floor(math.log10(low))
         last = math.ceil(math.log10(high))
         steps = (1, 2, 5) if last - first <= 4 else (1,)
-        values = [m * 10.0**e for e in range(first, last + 1) for m in steps]
-        return [_round(v) for v in values if low * 0.999 <= v <= high * 1.001]
+        ticks = []
+        for exponent in range(first, last + 1):
+            values = [step * 10.0**exponent for step in steps]
+            ticks += [_round(v) for v in values if low * 0.999 <= v <= high * 1.001]
+        return ticks
     raw = (high - low) / 5
     unit = 10.0 ** math.floor(math.log10(raw))
     step = unit * min((1, 2, 2.5, 5, 10), key=lambda m: abs(m * unit - raw))
     first = math.ceil(low / step - 1e-9)
-    return [_round(k * step) for k in range(first, math.floor(high / step + 1e-9) + 1)]
+    last = math.floor(high / step + 1e-9)
+    return [_round(k * step) for k in range(first, last + 1)]
 
 
 def _round(value: float) -> float:
-    return int(value) if value == int(value) else round(value, 10)
+    if value == int(value):
+        return int(value)
+    return round(value, 10)
 
 
 class _Axis:
     """Map from values to pixels."""
 
-    def __init__(self, values: Sequence[float], start: float, end: float, *, log: bool) -> None:
+    def __init__(
+        self,
+        values: Sequence[float],
+        start: float,
+        end: float,
+        *,
+        log: bool,
+    ) -> None:
         self.log = log
         self._start = start
         self._end = end
@@ -147,8 +159,18 @@ def draw_chart(
     ]
     if not points:
         return ""
-    x = _Axis([p.x for p in points], _LEFT, _WIDTH - _RIGHT, log=log)
-    y = _Axis([p.y for p in points], _HEIGHT - _BOTTOM, _TOP, log=False)
+    x = _Axis(
+        [p.x for p in points],
+        _LEFT,
+        _WIDTH - _RIGHT,
+        log=log,
+    )
+    y = _Axis(
+        [p.y for p in points],
+        _HEIGHT - _BOTTOM,
+        _TOP,
+        log=False,
+    )
     parts = [*_draw_grid(x, y), _draw_captions(x_label, y_label)]
     if front:
         parts.append(_draw_front(find_front(points), x, y))
@@ -201,11 +223,14 @@ def _draw_captions(x_label: str, y_label: str) -> str:
 
 def _draw_front(points: Sequence[Point], x: _Axis, y: _Axis) -> str:
     """Draw the front as a staircase: between two points the left one is still the best."""
-    corners = [f"{x(points[0].x):.1f},{y(points[0].y):.1f}"]
-    for before, after in pairwise(points):
-        corners.append(f"{x(after.x):.1f},{y(before.y):.1f}")
-        corners.append(f"{x(after.x):.1f},{y(after.y):.1f}")
-    corners.append(f"{_WIDTH - _RIGHT},{y(points[-1].y):.1f}")
+    height = y(points[0].y)
+    corners = [f"{x(points[0].x):.1f},{height:.1f}"]
+    for point in points[1:]:
+        across = x(point.x)
+        corners.append(f"{across:.1f},{height:.1f}")
+        height = y(point.y)
+        corners.append(f"{across:.1f},{height:.1f}")
+    corners.append(f"{_WIDTH - _RIGHT},{height:.1f}")
     return f'<polyline class="front" points="{" ".join(corners)}"/>'
 
 
@@ -215,7 +240,8 @@ def _draw_lines(points: Sequence[Point], x: _Axis, y: _Axis) -> list[str]:
         groups.setdefault((point.series, point.mark), []).append(point)
     out = []
     for (series, _), members in groups.items():
-        path = " ".join(f"{x(p.x):.1f},{y(p.y):.1f}" for p in sorted(members, key=lambda p: p.x))
+        members.sort(key=lambda p: p.x)
+        path = " ".join(f"{x(p.x):.1f},{y(p.y):.1f}" for p in members)
         out.append(f'<polyline class="line s{series}" points="{path}"/>')
     return out
 

@@ -68,7 +68,12 @@ class Drawn:
         self._kept: dict[_Key, dict[str, tuple[Bytes, float]]] = {}
 
     def keep(
-        self, scene: str, targets: Targets, view: int, score: ViewScore, image: Float32
+        self,
+        scene: str,
+        targets: Targets,
+        view: int,
+        score: ViewScore,
+        image: Float32,
     ) -> None:
         """Keep a scene's picture and PSNR if the report may show the view; the result is scored first."""
         key = _identify(targets.cameras[view])
@@ -184,9 +189,16 @@ def write_distill_report(
         named = zip(renderers, view.images, view.psnrs, strict=True)
         shown = [Shown(stage, image, f"{score:.2f} dB") for stage, image, score in named]
         height, width = view.target.shape[:2]
-        page.comparison(f"{view.name}, {width}×{height} px", view.target, shown[::-1])
+        page.comparison(
+            f"{view.name}, {width}×{height} px",
+            view.target,
+            shown[::-1],
+        )
 
-    source = "a photo" if report.photos else f"a photo or a render of the {DENSE}"
+    if report.photos:
+        source = "a photo"
+    else:
+        source = f"a photo or a render of the {DENSE}"
     if "photo" not in report.against:
         source = f"a render of the {DENSE}"
     page.heading("A typical view")
@@ -203,13 +215,13 @@ def write_distill_report(
     for line in list_remarks(report):
         page.paragraph(line, warns=line.startswith("warning"))
     lost = _find_worsened(before, after)
-    if lost:
-        page.paragraph(
-            f"Views that ended below their start: {', '.join(text for _, text in lost)}."
-        )
     shown = _choose_worst(after)
-    if lost and lost[0][0] not in shown:
-        shown = [lost[0][0], *shown][:_SHOWN]
+    if lost:
+        names = ", ".join(text for _, text in lost)
+        page.paragraph(f"Views that ended below their start: {names}.")
+        most_lost, _ = lost[0]
+        if most_lost not in shown:
+            shown = [most_lost, *shown][:_SHOWN]
     shown.sort(key=lambda row: after[row].psnr)
     worst = [view for view in shown if after[view].name != best.name]
     if worst:
@@ -242,11 +254,11 @@ _ADAPT = "g2ard adapt {} --views photos/ -o adapted.ply          # colours of ot
 
 def describe_edges(kinds: Sequence[KindScore]) -> str | None:
     """Return the scores of thin structures, None without them."""
-    found = [
-        f"{kind.kind} {change.before:.2f} → {change.after:.2f} dB"
-        for kind in kinds
-        if (change := kind.change("edge_psnr"))
-    ]
+    found = []
+    for kind in kinds:
+        change = kind.change("edge_psnr")
+        if change:
+            found.append(f"{kind.kind} {change.before:.2f} → {change.after:.2f} dB")
     if found:
         return f"Edges, wires and text (PSNR of gradients): {', '.join(found)}."
     return None
@@ -266,7 +278,10 @@ def summarize_run(report: RunReport) -> str:
     '500 of 5,000 Gaussians reproduce the photos at 36.6 dB, the mean of 12 held-out views of 800×600 px; ...'
     """
     kinds = report.kinds
-    what = "photos" if "photo" in report.against else DENSE
+    if "photo" in report.against:
+        what = "photos"
+    else:
+        what = DENSE
     if not kinds:
         return f"{plural(report.output_count, 'Gaussian')}; no held-out view shows the scene."
     weakest = min(kinds, key=lambda kind: kind.psnr.after)
@@ -275,7 +290,10 @@ def summarize_run(report: RunReport) -> str:
         last = f"{weakest.kind} views are weakest ({weakest.psnr.after:.1f} dB)"
     views = sum(kind.views for kind in kinds)
     mean = sum(kind.views * kind.psnr.after for kind in kinds) / views
-    over = f"the mean of {views} held-out views" if views > 1 else "in one held-out view"
+    if views > 1:
+        over = f"the mean of {views} held-out views"
+    else:
+        over = "in one held-out view"
     at = f"{mean:.1f} dB, {over} of {report.size}"
     if report.own_size:
         full = report.own_size["recovered"]
@@ -306,7 +324,8 @@ def _choose_worst(scores: Sequence[ViewScore]) -> list[int]:
     kinds = [sorted(rows, key=lambda row: scores[row].psnr) for rows in found.values()]
     kinds.sort(key=lambda rows: fmean(scores[row].psnr for row in rows))
     turns = chain.from_iterable(zip_longest(*kinds))
-    return [row for row in turns if row is not None][:_SHOWN]
+    worst = [row for row in turns if row is not None]
+    return worst[:_SHOWN]
 
 
 def write_preview(
@@ -316,19 +335,24 @@ def write_preview(
 
     Small images are enlarged, so that the picture is at least 1,200 pixels wide.
     """
-    rows = [[view.target, *view.images] for view in drawn]
-    times = max(1, math.ceil(_PICTURE / sum(image.shape[1] for image in rows[0])))
     names = [name for name, _ in scenes]
+    counts = [len(splats) for _, splats in scenes]
+    rows = [[view.target, *view.images] for view in drawn]
+    width = sum(image.shape[1] for image in rows[0])
+    times = max(1, math.ceil(_PICTURE / width))
     captions = []
     for row, view in enumerate(drawn):
         rows[row] = [image.repeat(times, 0).repeat(times, 1) for image in rows[row]]
         psnrs = [f"{name} {psnr:.2f} dB" for name, psnr in zip(names, view.psnrs, strict=True)]
         captions.append(", ".join([view.name, *psnrs]))
-    labels = [TARGET, *label_scenes(names, [len(splats) for _, splats in scenes])]
-    write_png(path, draw_contact_sheet(rows, labels, row_labels=captions), overwrite=True)
+    labels = [TARGET, *label_scenes(names, counts)]
+    sheet = draw_contact_sheet(rows, labels, row_labels=captions)
+    write_png(path, sheet, overwrite=True)
 
 
 def grey_unscored(image: Float32, targets: Targets, view: int) -> Float32:
     """Return an image of a view with the pixels that are not scored in grey."""
     mask = mask_of(targets, view)
-    return image if mask is None else np.where(mask[..., None], image, _UNSCORED)
+    if mask is None:
+        return image
+    return np.where(mask[..., None], image, _UNSCORED)

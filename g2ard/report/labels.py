@@ -76,8 +76,10 @@ def label_scenes(
     ['dense scene: garden, 2,000 Gaussians']
     """
     names = iter(name_scenes([scene.path for scene in scenes if isinstance(scene, Source)]))
-    named = [next(names) if isinstance(scene, Source) else scene for scene in scenes]
-    sizes = [count_content(count, scene) for count, scene in zip(counts, scenes, strict=True)]
+    labels = []
+    for scene, count in zip(scenes, counts, strict=True):
+        name = next(names) if isinstance(scene, Source) else scene
+        labels.append((name, count_content(count, scene)))
     if not roles:
-        return [f"{name}: {size}" for name, size in zip(named, sizes, strict=True)]
-    return [f"{role}: {name}, {size}" for role, name, size in zip(roles, named, sizes, strict=True)]
+        return [f"{name}: {size}" for name, size in labels]
+    return [f"{role}: {name}, {size}" for role, (name, size) in zip(roles, labels, strict=True)]

@@ -68,8 +68,13 @@ def label_sizes(names: Sequence[str], counts: Sequence[int], dense: int | None) 
     >>> label_sizes(["a.ply", "a.sog"], [100, 100], 1000)
     ['a.ply', 'a.sog']
     """
-    found = [_abbreviate(n) if dense is None else f"{dense / n:.3g}×" for n in counts]
-    return list(names) if len(set(found)) < len(found) else found
+    if dense is None:
+        found = [_abbreviate(count) for count in counts]
+    else:
+        found = [f"{dense / count:.3g}×" for count in counts]
+    if len(set(found)) < len(found):
+        return list(names)
+    return found
 
 
 def _abbreviate(count: int) -> str:
@@ -86,12 +91,11 @@ def recommend_size(rungs: Sequence[Rung]) -> str:
     below the best.
     """
     by_photos = any(view.against == "photo" for view in rungs[0].scores.views)
-    best = max(rung.scores.psnr for rung in rungs)
-    enough = [
-        rung
-        for rung in rungs
-        if (rung.scores.psnr >= best - _EQUAL_LOSS if by_photos else rung.worst.lost < _VISIBLE)
-    ]
+    if by_photos:
+        best = max(rung.scores.psnr for rung in rungs)
+        enough = [rung for rung in rungs if rung.scores.psnr >= best - _EQUAL_LOSS]
+    else:
+        enough = [rung for rung in rungs if rung.worst.lost < _VISIBLE]
     if not enough:
         largest = rungs[-1]
         return (
@@ -140,7 +144,12 @@ def write_ladder(
     renderers = [Renderer(rung.splats, background=background, settings=settings) for rung in rungs]
     score = partial(evaluate, targets=best, background=background, settings=settings)
 
-    def show(title: str, part: Targets, row: int, psnrs: Sequence[float]) -> None:
+    def show(
+        title: str,
+        part: Targets,
+        row: int,
+        psnrs: Sequence[float],
+    ) -> None:
         shown = [
             Shown(
                 rung.label,
@@ -152,7 +161,12 @@ def write_ladder(
         page.comparison(title, to_bytes(grey_unscored(part[row], part, row)), shown)
 
     page.heading("The same view")
-    show(best.cameras.names[0], best, 0, [score(rung.splats).views[0].psnr for rung in rungs])
+    show(
+        best.cameras.names[0],
+        best,
+        0,
+        [score(rung.splats).views[0].psnr for rung in rungs],
+    )
     page.heading("The worst view of each size")
     for name in dict.fromkeys(rung.worst.name for rung in rungs):
         row = targets.cameras.names.index(name)
@@ -167,11 +181,10 @@ _COLUMNS = ("scene", "size", "Gaussians", "MB", "PSNR, dB", "worst view", "detai
 
 
 def _list_rows(rungs: Sequence[Rung], dense: Dense | None) -> list[list[str]]:
-    top = (
-        []
-        if dense is None
-        else [[dense.name, "1×", f"{dense.count:,}", _format_megabytes(dense.bytes), *[""] * 4]]
-    )
+    if dense is None:
+        top = []
+    else:
+        top = [[dense.name, "1×", f"{dense.count:,}", _format_megabytes(dense.bytes), *[""] * 4]]
     return top + [
         [
             rung.name,

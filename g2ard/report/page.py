@@ -50,7 +50,8 @@ def slice_window(window: Window, height: int, width: int) -> tuple[slice, slice]
 
 def _slice_span(start: float, extent: float, size: int) -> slice:
     first = min(int(start * size + 1e-6), size - 1)
-    return slice(first, max(first + 1, min(size, round((start + extent) * size))))
+    last = min(size, round((start + extent) * size))
+    return slice(first, max(first + 1, last))
 
 
 def find_worst_windows(image: Bytes, target: Bytes) -> list[Window]:
@@ -60,16 +61,19 @@ def find_worst_windows(image: Bytes, target: Bytes) -> list[Window]:
     rows = max(1, int(_WINDOW * height))
     columns = max(1, int(_WINDOW * width))
     total = np.pad(error, ((1, 0), (1, 0))).cumsum(0).cumsum(1)
-    sums = (
-        total[rows:, columns:]
-        - total[:-rows, columns:]
-        - total[rows:, :-columns]
-        + total[:-rows, :-columns]
-    )
+    sums = total[rows:, columns:] - total[:-rows, columns:]
+    sums -= total[rows:, :-columns]
+    sums += total[:-rows, :-columns]
     found: list[Window] = []
     while len(found) < _CROPS and sums.max() >= 0:
         top, left = divmod(int(np.argmax(sums)), sums.shape[1])
-        found.append((left / width, top / height, columns / width, rows / height))
+        window = (
+            left / width,
+            top / height,
+            columns / width,
+            rows / height,
+        )
+        found.append(window)
         # No later window may overlap this one.
         above = max(0, top - rows + 1)
         before = max(0, left - columns + 1)
@@ -127,7 +131,10 @@ class Page:
         for i, row in enumerate(rows):
             cells = ""
             for j, (name, cell) in enumerate(zip(columns, row, strict=True)):
-                bold = mark if (i, j) in best else ""
+                if (i, j) in best:
+                    bold = mark
+                else:
+                    bold = ""
                 cells += f'<td data-column="{escape(name)}"{bold}>{escape(cell)}</td>'
             body.append(f"<tr>{cells}</tr>")
         self._parts.append(
@@ -144,7 +151,11 @@ class Page:
         )
 
     def comparison(
-        self, title: str, target: Bytes, shown: Sequence[Shown], name: str = TARGET
+        self,
+        title: str,
+        target: Bytes,
+        shown: Sequence[Shown],
+        name: str = TARGET,
     ) -> None:
         """Add a view: a slider between the target, with a `name`, and any rendering, and magnified crops.
 

@@ -66,8 +66,12 @@ def write_registration_report(
             photo = to_bytes(load_photo(one, 0, background)[0])
         except InputError:
             continue  # deleted since it was registered
-        render = to_bytes(renderer.image(replace(one[0], viewmat=np.array(row.camera_from_world))))
-        alike = "kept at its start" if row.zncc is None else f"ZNCC {row.zncc:.2f}"
+        view = replace(one[0], viewmat=np.array(row.camera_from_world))
+        render = to_bytes(renderer.image(view))
+        if row.zncc is None:
+            alike = "kept at its start"
+        else:
+            alike = f"ZNCC {row.zncc:.2f}"
         shown = [Shown("render", render, alike)]
         if row.name in starts:
             start = renderer.image(replace(one[0], viewmat=starts[row.name]))

@@ -83,7 +83,9 @@ class KindScore(Report):
     def change(self, score: str) -> Change | None:
         """Return a mean score of both scenes; None if it was not measured."""
         before, after = (scores.scores[score] for scores in (self.before, self.after))
-        return None if math.isnan(after) else Change(before, after)
+        if math.isnan(after):
+            return None
+        return Change(before, after)
 
     def as_dict(self) -> dict[str, Any]:
         """Return the report as JSON values, with one change per score."""
@@ -141,14 +143,14 @@ def list_cells(kinds: Iterable[KindScore]) -> list[list[str]]:
 
 def _list_scores(before: Scores, after: Scores, worst: str) -> list[str]:
     """Return the cells of `COLUMNS` from PSNR on."""
-    psnr, detail, ssim = (
-        "–"
-        if math.isnan(after.scores[name])
-        else " → ".join(
-            f"{scores.scores[name]:.{METRICS[name].digits}f}" for scores in (before, after)
-        )
-        for name in ("psnr", "detail", "ssim")
-    )
+    cells = []
+    for name in ("psnr", "detail", "ssim"):
+        digits = METRICS[name].digits
+        if math.isnan(after.scores[name]):
+            cells.append("–")
+        else:
+            cells.append(f"{before.scores[name]:.{digits}f} → {after.scores[name]:.{digits}f}")
+    psnr, detail, ssim = cells
     return [psnr, worst, detail, ssim]
 
 
@@ -287,7 +289,10 @@ class RunReport(Report):
         before, output, file = (
             (self.bytes[name] or 0) / 1e6 for name in ("input", "output", "file")
         )
-        start = "" if self.photos else f"{before:.2f} → "
+        if self.photos:
+            start = ""
+        else:
+            start = f"{before:.2f} → "
         if self.packed is None:
             return f"{start}{file or output:.2f} MB as .ply"
         start = start.replace(" → ", " MB as .ply → ")
@@ -384,7 +389,10 @@ def describe_loss(kind: KindScore, hint: str) -> str | None:
         return f"recovery lost {-ssim:.3f} SSIM and gained {psnr:.2f} dB in {kind.kind} views"
     lost = f"{kind.lost} of {kind.views}"
     if psnr < -LOST or ssim < -_LOST_SSIM:
-        how = f"{-psnr:.2f} dB" if psnr < -LOST else f"{-ssim:.3f} SSIM"
+        if psnr < -LOST:
+            how = f"{-psnr:.2f} dB"
+        else:
+            how = f"{-ssim:.3f} SSIM"
         where = f"{lost} views lost PSNR"
         if kind.worst_psnr.gain < 0:
             where = f"worst view {kind.worst}: {kind.worst_psnr.before:.2f} → {kind.worst_psnr.after:.2f} dB"
@@ -397,7 +405,12 @@ def describe_loss(kind: KindScore, hint: str) -> str | None:
     )
 
 
-def score_lines(packed: Packed, size: int, unpacked: float, pixels: str) -> list[str]:
+def score_lines(
+    packed: Packed,
+    size: int,
+    unpacked: float,
+    pixels: str,
+) -> list[str]:
     """Return a packed file's size in bytes and score beside that of the unpacked scene, and a warning if its
     loss is large and visible. `pixels` is the size of the views.
 

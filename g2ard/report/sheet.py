@@ -39,25 +39,37 @@ def draw_contact_sheet(
     text = max(11, min(28, max(widths) // 20))
     font = ImageFont.load_default(text)
     line = round(1.6 * text)
+    foot = line if row_labels else 0
     for c, label in enumerate(labels[:columns]):
         widths[c] = max(widths[c], math.ceil(font.getlength(label)))
     longest = max((math.ceil(font.getlength(caption)) for caption in row_labels), default=0)
-    widths[-1] += max(0, longest - sum(widths) - _SHEET_GAP * (columns - 1))
-    foot = line if row_labels else 0
-    lefts = [_SHEET_GAP + sum(widths[:c]) + _SHEET_GAP * c for c in range(columns)]
-    size = (
-        sum(widths) + _SHEET_GAP * (columns + 1),
-        line + sum(heights) + (foot + _SHEET_GAP) * len(grid) + _SHEET_GAP,
-    )
-    sheet = Image.new("RGB", size, (24, 24, 24))
+    gaps = _SHEET_GAP * (columns - 1)
+    widths[-1] += max(0, longest - sum(widths) - gaps)
+    lefts = []
+    left = _SHEET_GAP
+    for width in widths:
+        lefts.append(left)
+        left += width + _SHEET_GAP
+    bottom = line + sum(heights) + (foot + _SHEET_GAP) * len(grid) + _SHEET_GAP
+    sheet = Image.new("RGB", (left, bottom), (24, 24, 24))
     draw = ImageDraw.Draw(sheet)
     for left, label in zip(lefts, labels, strict=False):
-        draw.text((left, _SHEET_GAP), label, fill=(235, 235, 235), font=font)
+        draw.text(
+            (left, _SHEET_GAP),
+            label,
+            fill=(235, 235, 235),
+            font=font,
+        )
     top = _SHEET_GAP + line
     for r, (row, height) in enumerate(zip(grid, heights, strict=True)):
         for left, cell in zip(lefts, row, strict=False):
             sheet.paste(cell, (left, top))
         if r < len(row_labels):
-            draw.text((_SHEET_GAP, top + height), row_labels[r], fill=(200, 200, 200), font=font)
+            draw.text(
+                (_SHEET_GAP, top + height),
+                row_labels[r],
+                fill=(200, 200, 200),
+                font=font,
+            )
         top += height + foot + _SHEET_GAP
     return np.asarray(sheet)
