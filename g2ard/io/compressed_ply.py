@@ -11,7 +11,6 @@ import numpy as np
 from numpy.lib.recfunctions import structured_to_unstructured, unstructured_to_structured
 
 from g2ard.arrays import Float, Float32, Values
-from g2ard.config.choices import RenderModel
 from g2ard.errors import InputError
 from g2ard.io.atomic import atomic_output
 from g2ard.io.packing import (
@@ -47,10 +46,24 @@ _SCALE_LIMIT = 20.0
 
 _VECTOR_BITS = 11, 10, 11  # bits of the three components of a position or scale
 _BOUNDS = [
-    f"{end}_{name}"
-    for names in (("x", "y", "z"), ("scale_x", "scale_y", "scale_z"), ("r", "g", "b"))
-    for end in ("min", "max")
-    for name in names
+    "min_x",
+    "min_y",
+    "min_z",
+    "max_x",
+    "max_y",
+    "max_z",
+    "min_scale_x",
+    "min_scale_y",
+    "min_scale_z",
+    "max_scale_x",
+    "max_scale_y",
+    "max_scale_z",
+    "min_r",
+    "min_g",
+    "min_b",
+    "max_r",
+    "max_g",
+    "max_b",
 ]
 """Bounds of a chunk: of positions, log-scales and colours."""
 
@@ -65,29 +78,35 @@ class Stream(RawStream):
         require(header.properties("vertex"), _PACKED, "a compressed scene")
         chunk_properties = header.properties("chunk")
         # older files: colours over [0, 1]
-        bounds = _BOUNDS if "min_r" in chunk_properties else _BOUNDS[:12]
+        if "min_r" in chunk_properties:
+            bounds = _BOUNDS
+        else:
+            bounds = _BOUNDS[:12]
         require(chunk_properties, bounds, "a compressed scene", "chunk")
         rest = [p for p in header.properties("sh") if re.fullmatch(r"f_rest_\d+", p)]
         if len(rest) not in (0, 9, 24, 45) or set(rest) != set(_rest_names(len(rest))):
             raise InputError(f"element 'sh' has {len(rest)} coefficients; expected 9, 24 or 45")
 
-        names = ("vertex", "chunk", "sh") if rest else ("vertex", "chunk")
+        names = ["vertex", "chunk"]
+        if rest:
+            names.append("sh")
         vertex, chunk, *sh = read_element(path, header, *names)
         count = len(vertex)
-        if len(chunk) * _CHUNK_ROWS < count or (sh and len(sh[0]) != count):
+        if len(chunk) * _CHUNK_ROWS < count or any(len(each) != count for each in sh):
             raise InputError(f"{len(chunk)} chunks and {plural(count, 'Gaussian')} do not fit")
         for name in _PACKED:
             if vertex.dtype[name] != np.uint32:
                 raise InputError(f"has type {vertex.dtype[name]}, expected uint", property=name)
         offset = offset_of(header)
-        mode = render_model_of(header.comments)
-        model: RenderModel = "antialiased" if mode == "antialiased" else "classic"
+        model = render_model_of(header.comments)
+        if model != "antialiased":
+            model = "classic"
         self._rest = len(rest) // 3
         super().__init__(path, count, self._rest, offset, render_model=model)
         self.up = up_of(header.comments)
         self.restore(axes_of(header))
         self._vertex = vertex
-        self._sh = sh[0] if sh else None
+        self._sh = next(iter(sh), None)
         kinds = len(bounds) // 6
         self._bounds = np.zeros((len(chunk), 3, 2, 3))
         self._bounds[:, kinds:, 1] = 1
@@ -109,7 +128,8 @@ class Stream(RawStream):
         raw.means[:] = _between(means, first, _unpacked(position, _VECTOR_BITS))
         raw.log_scales[:] = _between(scales, first, _unpacked(scale, _VECTOR_BITS))
         others = (_unpacked(rotation, (10, 10, 10)) - 0.5) * np.sqrt(2)
-        raw.quats[:] = from_smallest_three(rotation >> np.uint32(30), others)
+        largest = rotation >> np.uint32(30)
+        raw.quats[:] = from_smallest_three(largest, others)
         rgba = _unpacked(color, (8, 8, 8, 8))
         rgb = _between(colors, first, rgba[:, :3])
         raw.sh0[:, 0] = (rgb - 0.5) / SH_C0
@@ -125,7 +145,7 @@ def _between(bounds: Values, first: int, t: Float) -> Float:
     """Interpolate by `t` between the (chunks, 2, 3) bounds of each Gaussian's chunk, from row `first` on."""
     chunks = np.arange(first, first + len(t)) // _CHUNK_ROWS
     low, high = bounds[chunks].astype(float).swapaxes(0, 1)
-    return np.asarray(low * (1 - t) + high * t)
+    return low * (1 - t) + high * t
 
 
 def _coefficient(codes: Values) -> Float:
@@ -155,13 +175,19 @@ def write(path: Path, splats: Splats, *, overwrite: bool = False) -> float:
     largest, others = smallest_three(unit_quats(splats.quats))
     rotations = _packed(others / math.sqrt(2) + 0.5, (10, 10, 10))
     words["packed_rotation"] = largest.astype(np.uint32) << np.uint32(30) | rotations
-    scales, shares = _within(np.clip(log_scales(splats), -_SCALE_LIMIT, _SCALE_LIMIT))
+    logs = np.clip(log_scales(splats), -_SCALE_LIMIT, _SCALE_LIMIT)
+    scales, shares = _within(logs)
     words["packed_scale"] = _packed(shares, _VECTOR_BITS)
     colors, shares = _within(splats.colors)
-    words["packed_color"] = _packed(np.column_stack([shares, splats.opacities]), (8, 8, 8, 8))
+    rgba = np.column_stack([shares, splats.opacities])
+    words["packed_color"] = _packed(rgba, (8, 8, 8, 8))
     bounds = np.concatenate([means, scales, colors], axis=1).reshape(len(means), -1)
-    chunk = unstructured_to_structured(bounds, np.dtype([(name, "<f4") for name in _BOUNDS]))
-    elements = [PlyElement.describe(chunk, "chunk"), PlyElement.describe(words, "vertex")]
+    types = np.dtype([(name, "<f4") for name in _BOUNDS])
+    chunk = unstructured_to_structured(bounds, types)
+    elements = [
+        PlyElement.describe(chunk, "chunk"),
+        PlyElement.describe(words, "vertex"),
+    ]
     if splats.sh_degree:
         elements.append(PlyElement.describe(_harmonics(splats), "sh"))
     comments = comments_of(splats)
@@ -174,8 +200,9 @@ def write(path: Path, splats: Splats, *, overwrite: bool = False) -> float:
 def _within(values: Values) -> tuple[Float32, Float]:
     """Return the (chunks, 2, 3) bounds of the values of chunks, and values scaled to [0, 1] within them."""
     starts = np.arange(0, len(values), _CHUNK_ROWS)
-    ends = np.stack([limit.reduceat(values, starts) for limit in (np.minimum, np.maximum)], axis=1)
-    ends = ends.astype(np.float32)
+    lows = np.minimum.reduceat(values, starts)
+    highs = np.maximum.reduceat(values, starts)
+    ends = np.stack([lows, highs], axis=1).astype(np.float32)
     chunks = np.arange(len(values)) // _CHUNK_ROWS
     low, high = ends[chunks].astype(float).swapaxes(0, 1)
     wide = high - low

@@ -46,8 +46,10 @@ from g2ard.scene.transform import (
 EXTENSION = "KHR_gaussian_splatting"
 SPZ_EXTENSION = f"{EXTENSION}_compression_spz_2"
 _SPZ_EXTENSIONS = (
-    *(SPZ_EXTENSION, f"{EXTENSION}_compression_spz"),
-    *("KHR_spz_gaussian_splats_compression", "KHR_spz_compression"),
+    SPZ_EXTENSION,
+    f"{EXTENSION}_compression_spz",
+    "KHR_spz_gaussian_splats_compression",
+    "KHR_spz_compression",
 )
 """The extension of an SPZ, and its earlier names: within the splats' extension, or beside or without it."""
 
@@ -62,14 +64,26 @@ _BIN = 0x004E4942  # "BIN"
 _FLOAT = 5126
 _USHORT = 5123
 _UBYTE = 5121
+_ARRAY_BUFFER = 34962
 _TYPES = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
-_DTYPES = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
+_TYPE_OF_WIDTH = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
+_DTYPES = {
+    5120: "i1",
+    _UBYTE: "u1",
+    5122: "<i2",
+    _USHORT: "<u2",
+    _FLOAT: "<f4",
+}
 _GLTF_TURN = np.array([-1.0, -1, 1])
 _SH_FLIPS = harmonic_signs(_GLTF_TURN)
 
 
 def write(
-    path: Path, splats: Splats, *, overwrite: bool = False, compress: str | None = None
+    path: Path,
+    splats: Splats,
+    *,
+    overwrite: bool = False,
+    compress: str | None = None,
 ) -> float:
     """Write a .glb with KHR_gaussian_splatting; equal scenes give equal bytes.
 
@@ -105,17 +119,22 @@ def _plain(splats: Splats) -> list[bytes]:
         blob += b"\0" * (-len(blob) % 4)
         accessor = {
             "bufferView": len(views),
-            "componentType": _USHORT if values.dtype == np.uint16 else _FLOAT,
+            "componentType": _FLOAT,
             "count": len(splats),
-            "type": {1: "SCALAR", 3: "VEC3", 4: "VEC4"}[values.shape[1]],
+            "type": _TYPE_OF_WIDTH[values.shape[1]],
         }
         if values.dtype == np.uint16:
+            accessor["componentType"] = _USHORT
             accessor["normalized"] = True
         if name == "POSITION":
-            accessor |= {end: getattr(values, end)(axis=0).tolist() for end in ("min", "max")}
-        views.append(
-            {"buffer": 0, "byteOffset": start, "byteLength": values.nbytes, "target": 34962}
-        )
+            accessor |= _ends(values)
+        view = {
+            "buffer": 0,
+            "byteOffset": start,
+            "byteLength": values.nbytes,
+            "target": _ARRAY_BUFFER,
+        }
+        views.append(view)
         accessors.append(accessor)
         blobs.append(blob)
         start += len(blob)
@@ -127,6 +146,13 @@ def _plain(splats: Splats) -> list[bytes]:
     return _glb(document, blobs)
 
 
+def _ends(means: Values) -> Json:
+    return {
+        "min": means.min(axis=0).tolist(),
+        "max": means.max(axis=0).tolist(),
+    }
+
+
 def spz_glb(splats: Splats, centre: Float | None = None) -> tuple[list[bytes], float]:
     """Return the parts of a .glb that holds an SPZ, and the largest change of a position by rounding.
 
@@ -135,31 +161,54 @@ def spz_glb(splats: Splats, centre: Float | None = None) -> tuple[list[bytes], f
     movable = centre is not None
     if centre is None:
         centre = np.zeros(3)
-    bits = spz.fraction_bits(splats.means.astype(float) - centre, splats, movable=movable)
-    splats = splats.take(packing_order(splats.means))
-    means = (splats.means.astype(float) - centre) * (-1, 1, -1)
+    near = splats.means.astype(float) - centre
+    bits = spz.fraction_bits(near, splats, movable=movable)
+    order = packing_order(splats.means)
+    splats = splats.take(order)
+    means = near[order] * (-1, 1, -1)
     blob = spz.encoded(_about_y(splats), means, bits, _SPZ_VERSION)
     steps = 1 << bits
     stored = np.rint(means * (1, -1, -1) * steps) / steps
-    ends = {end: getattr(stored, end)(axis=0).tolist() for end in ("min", "max")}
-    names = {"POSITION": "VEC3", "COLOR_0": "VEC4"}
-    names |= {f"{EXTENSION}:SCALE": "VEC3", f"{EXTENSION}:ROTATION": "VEC4"}
-    names |= {name: "VEC3" for name, _ in _harmonics(splats.sh_degree)}
+    names = {
+        "POSITION": "VEC3",
+        "COLOR_0": "VEC4",
+        f"{EXTENSION}:SCALE": "VEC3",
+        f"{EXTENSION}:ROTATION": "VEC4",
+    }
+    for name, _ in _harmonics(splats.sh_degree):
+        names[name] = "VEC3"
     accessors: list[Json] = [
         {"componentType": _FLOAT, "count": len(splats), "type": kind} for kind in names.values()
     ]
-    accessors[0] |= ends
+    accessors[0] |= _ends(stored)
     accessors[1] |= {"componentType": _UBYTE, "normalized": True}
     # CesiumJS needs a `matrix`, and takes the SPZ from the first buffer view.
     matrix = np.eye(4)
     matrix[3, :3] = (splats.offset + centre) * _GLTF_TURN
-    node = {"mesh": 0, "matrix": matrix.ravel().tolist(), **_extras(splats)}
-    view = {"buffer": 0, "byteOffset": 0, "byteLength": len(blob)}
+    node = {
+        "mesh": 0,
+        "matrix": matrix.ravel().tolist(),
+        **_extras(splats),
+    }
+    view = {
+        "buffer": 0,
+        "byteOffset": 0,
+        "byteLength": len(blob),
+    }
     blob += b"\0" * (-len(blob) % 4)
-    document = _document(node, list(names), [view], accessors, len(blob))
-    splatting = document["meshes"][0]["primitives"][0]["extensions"][EXTENSION]
+    document = _document(
+        node,
+        list(names),
+        [view],
+        accessors,
+        len(blob),
+    )
+    primitive = document["meshes"][0]["primitives"][0]
+    splatting = primitive["extensions"][EXTENSION]
     splatting["extensions"] = {SPZ_EXTENSION: {"bufferView": 0}}
-    document["extensionsUsed"] = document["extensionsRequired"] = [EXTENSION, SPZ_EXTENSION]
+    extensions = [EXTENSION, SPZ_EXTENSION]
+    document["extensionsUsed"] = extensions
+    document["extensionsRequired"] = extensions
     return _glb(document, [blob]), spz.rounding(means, bits)
 
 
@@ -173,10 +222,9 @@ def _extras(splats: Splats) -> Json:
 def _about_y(splats: Splats) -> Splats:
     """Turn a scene by half a turn about y, exactly: from SPZ's axes to glTF's, seen in those of a .ply."""
     signs = harmonic_signs((-1, 1, -1))[: splats.shN.shape[1], None]
-    means = splats.means * np.array([-1, 1, -1], splats.means.dtype)
     return replace(
         splats,
-        means=means,
+        means=splats.means * np.array([-1, 1, -1], splats.means.dtype),
         quats=splats.quats * np.array([1, -1, 1, -1], np.float32),
         shN=splats.shN * signs,
     )
@@ -189,13 +237,15 @@ def _glb(document: Json, blobs: list[bytes]) -> list[bytes]:
     total = 12 + 8 + len(text) + 8 + start
     if total >= 1 << 32:
         raise InputError(f"not written: {total:,} bytes exceed the 4 GiB of a .glb")
-    head = struct.pack("<III", _MAGIC, 2, total) + struct.pack("<II", len(text), _JSON)
-    return [head, text, struct.pack("<II", start, _BIN), *blobs]
+    head = struct.pack("<IIIII", _MAGIC, 2, total, len(text), _JSON)
+    head_of_blobs = struct.pack("<II", start, _BIN)
+    return [head, text, head_of_blobs, *blobs]
 
 
 def _attributes(splats: Splats) -> dict[str, Values]:
-    linear = np.clip(splats.colors.astype(float), 0, 1)
-    linear = np.where(linear <= 0.04045, linear / 12.92, ((linear + 0.055) / 1.055) ** 2.4)
+    srgb = np.clip(splats.colors.astype(float), 0, 1)
+    bright = ((srgb + 0.055) / 1.055) ** 2.4
+    linear = np.where(srgb <= 0.04045, srgb / 12.92, bright)
     alphas = splats.opacities[:, None]
     quats = unit_quats(splats.quats)
     turned = quats[:, [1, 2, 3, 0]] * (*_GLTF_TURN, 1)
@@ -225,7 +275,11 @@ def _harmonics(degree: int) -> list[tuple[str, int]]:
 
 
 def _document(
-    node: Json, names: list[str], views: list[Any], accessors: list[Any], size: int
+    node: Json,
+    names: list[str],
+    views: list[Any],
+    accessors: list[Any],
+    size: int,
 ) -> Json:
     from g2ard._core import __version__
 
@@ -345,11 +399,12 @@ def _chunks(path: Path) -> tuple[Any, bytes]:
 
 def _with_buffer(path: Path, document: Any) -> tuple[Any, bytes]:
     """Return the document of a .gltf and its only buffer, which it holds in base64 or names beside it."""
-    buffers = document.get("buffers") if isinstance(document, dict) else None
+    buffers = None
+    uri = None
+    if isinstance(document, dict):
+        buffers = document.get("buffers")
     if isinstance(buffers, list) and len(buffers) == 1:
         uri = buffers[0].get("uri")
-    else:
-        uri = None
     if not isinstance(buffers, list) or not isinstance(uri, str):
         raise InputError("expected one buffer with a uri", hint="export it as .glb")
     document = {**document, "buffers": [{**buffers[0], "uri": None}]}
@@ -365,29 +420,35 @@ def _with_buffer(path: Path, document: Any) -> tuple[Any, bytes]:
 
 def _scene(path: Path, document: _Document, binary: bytes) -> Noted:
     """Read all splat primitives, each as often as nodes show it."""
-    others = sum(
-        not _has_splats(primitive) for mesh in document.meshes for primitive in mesh.primitives
-    )
     found = placed(_shown(path, document, binary))
+    primitives = [primitive for mesh in document.meshes for primitive in mesh.primitives]
     if found is None:
-        modes = {primitive.mode for mesh in document.meshes for primitive in mesh.primitives}
-        held = "points" if modes == {0} else "a mesh" if modes else "nothing"
-        hint = SCAN if modes == {0} else MESH if modes else None
+        modes = {primitive.mode for primitive in primitives}
+        held = "nothing"
+        hint = None
+        if modes == {0}:
+            held = "points"
+            hint = SCAN
+        elif modes:
+            held = "a mesh"
+            hint = MESH
         raise InputError(f"holds {held}: no primitive has {EXTENSION}", hint=hint)
-    text = f"{plural(others, 'other primitive')} ignored"
-    found = restored(found[0], _axes(document.nodes)), found[1]
+    scene, notes = found
+    others = sum(not _has_splats(primitive) for primitive in primitives)
     if others:
-        return (found[0], (Note("ignored_meshes", others, text), *found[1]))
-    return found
+        text = f"{plural(others, 'other primitive')} ignored"
+        notes = (Note("ignored_meshes", others, text), *notes)
+    return restored(scene, _axes(document.nodes)), notes
 
 
 def _axes(nodes: list[_Node]) -> Axes:
     """Return the axes that g2ard stated in a node, or those of a .ply."""
     for node in nodes:
-        own = node.extras.get("g2ard") if isinstance(node.extras, dict) else None
-        name = own.get("axes") if isinstance(own, dict) else None
-        if name in AXES:
-            return cast("Axes", name)
+        if not isinstance(node.extras, dict):
+            continue
+        own = node.extras.get("g2ard")
+        if isinstance(own, dict) and own.get("axes") in AXES:
+            return cast("Axes", own["axes"])
     return "RDF"
 
 
@@ -395,7 +456,11 @@ def _has_splats(primitive: _Primitive) -> bool:
     return any(map(_SPLATS.match, primitive.extensions))
 
 
-def _shown(path: Path, document: _Document, binary: bytes) -> Iterator[tuple[Noted, Float]]:
+def _shown(
+    path: Path,
+    document: _Document,
+    binary: bytes,
+) -> Iterator[tuple[Noted, Float]]:
     """Yield each splat primitive with each of its placements."""
     shown = _nodes_shown(path, document)
     for index, mesh in enumerate(document.meshes):
@@ -422,54 +487,77 @@ def placed(parts: Iterable[tuple[Noted, Float]]) -> Noted | None:
             raise error.at(parameter=None, message=f"a node {error.message}") from None
         moved.append(splats)
         uneven += not exact
-    if uneven:
-        text = (
-            f"{plural(uneven, 'part')} scaled unevenly: colours by direction follow approximately"
-        )
-        notes.append(Note("uneven_placement", uneven, text))
     if not moved:
         return None
-    return moved[0] if len(moved) == 1 else join(moved), tuple(notes)
+    if uneven:
+        parts_ = plural(uneven, "part")
+        text = f"{parts_} scaled unevenly: colours by direction follow approximately"
+        notes.append(Note("uneven_placement", uneven, text))
+    scene = moved[0]
+    if len(moved) > 1:
+        scene = join(moved)
+    return scene, tuple(notes)
 
 
-def _primitive(within: Place, document: _Document, binary: bytes, primitive: _Primitive) -> Noted:
+def _primitive(
+    within: Place,
+    document: _Document,
+    binary: bytes,
+    primitive: _Primitive,
+) -> Noted:
     """Read a primitive of splats, in the axes of a .ply, without its placement."""
     path = within.path
     place = within.to("extensions", EXTENSION)
     splats = checked(primitive.extensions.get(EXTENSION, {}), _Splatting, place)
     held = {*splats.extensions, *filter(_SPLATS.match, primitive.extensions)}
-    if unknown := sorted(held - {EXTENSION, *_SPZ_EXTENSIONS}):
-        raise InputError(f"unsupported extension {unknown[0]!r}")
+    unknown = held - {EXTENSION, *_SPZ_EXTENSIONS}
+    if unknown:
+        raise InputError(f"unsupported extension {min(unknown)!r}")
     if splats.quantized_position_scale != 1:
         raise place.to("quantizedPositionScale").error("is unsupported")
     if splats.kernel != "ellipse":
         raise InputError("unsupported kernel; expected 'ellipse'")
-    notes = [LINEAR_NOTE] if "lin" in str(splats.color_space).lower() else []
     name = next((name for name in _SPZ_EXTENSIONS if name in held), None)
     if name is None:
-        scene, own = _attributes_of(within.to("attributes"), document, binary, primitive.attributes)
+        scene, notes = _attributes_of(
+            within.to("attributes"),
+            document,
+            binary,
+            primitive.attributes,
+        )
     else:
-        within, inside = (place, splats) if name in splats.extensions else (within, primitive)
+        extensions = primitive.extensions
+        if name in splats.extensions:
+            within = place
+            extensions = splats.extensions
         place = within.to("extensions", name)
-        packed = checked(inside.extensions[name], _Compressed, place)
+        packed = checked(extensions[name], _Compressed, place)
         view = _view(document, packed.buffer_view, place, "the SPZ")
         start = view.byte_offset
-        scene, own = spz.decoded(path, binary[start : start + view.byte_length])
+        scene, notes = spz.decoded(path, binary[start : start + view.byte_length])
         scene = _about_y(scene)
-    return scene, (*notes, *own)
+    if "lin" in str(splats.color_space).lower():
+        notes = (LINEAR_NOTE, *notes)
+    return scene, notes
 
 
-def _attributes_of(place: Place, document: _Document, binary: bytes, names: Json) -> Noted:
+def _attributes_of(
+    place: Place,
+    document: _Document,
+    binary: bytes,
+    names: Json,
+) -> Noted:
     """Read the float or integer attributes of a primitive, in the axes of a .ply."""
 
     def values(name: str, width: int) -> Float32:
         if name not in names:
             raise InputError(f"attribute {name!r} is missing", path=place.path)
+        index = checked(names[name], Whole, place.to(name))
         return _accessor(
             place.to(name),
             document,
             binary,
-            checked(names[name], Whole, place.to(name)),
+            index,
             name,
             width,
         )
@@ -478,17 +566,23 @@ def _attributes_of(place: Place, document: _Document, binary: bytes, names: Json
     base = f"{EXTENSION}:SH_DEGREE_0_COEF_0"
     opacity = f"{EXTENSION}:OPACITY"
     names = {re.sub("^_", f"{EXTENSION}:", name): at for name, at in names.items()}
-    degree = max(d for d in range(4) if d == 0 or f"{EXTENSION}:SH_DEGREE_{d}_COEF_0" in names)
+    degree = 0
+    for band in (1, 2, 3):
+        if f"{EXTENSION}:SH_DEGREE_{band}_COEF_0" in names:
+            degree = band
     means = values("POSITION", 3)
     raw = Raw.empty(len(means), (degree + 1) ** 2 - 1)
     draft = base not in names and "COLOR_0" in names
-    color = values("COLOR_0", 4) if draft else np.zeros((0, 4), np.float32)
-    if draft and opacity not in names:
+    if draft:
+        color = values("COLOR_0", 4)
+        sh0 = (color[:, :3] - 0.5) / SH_C0
         opacities = color[:, 3]
-    else:
+    if not draft or opacity in names:
         opacities = values(opacity, 1)[:, 0]
-    sh0 = (color[:, :3] - 0.5) / SH_C0 if draft else values(base, 3)
-    notes = fill_linear(raw, values(f"{EXTENSION}:SCALE", 3), opacities, sh0)
+    if not draft:
+        sh0 = values(base, 3)
+    scales = values(f"{EXTENSION}:SCALE", 3)
+    notes = fill_linear(raw, scales, opacities, sh0)
     if draft:
         text = f"written by a draft of {EXTENSION} ({', '.join(own)})"
         notes.append(Note("first_draft", len(means), text))
@@ -508,7 +602,12 @@ def _entry(table: list[_Entry], index: int | None, place: Place) -> _Entry:
     return table[index]
 
 
-def _view(document: _Document, index: int | None, place: Place, what: str) -> _View:
+def _view(
+    document: _Document,
+    index: int | None,
+    place: Place,
+    what: str,
+) -> _View:
     """Return the buffer view whose index is a property of `place`; it must lie in the binary chunk."""
     view = _entry(document.buffer_views, index, place.to("bufferView"))
     within = Place(place.path).to("bufferViews", index or 0, "buffer")
@@ -519,30 +618,44 @@ def _view(document: _Document, index: int | None, place: Place, what: str) -> _V
 
 
 def _accessor(
-    place: Place, document: _Document, binary: bytes, index: int, name: str, width: int
+    place: Place,
+    document: _Document,
+    binary: bytes,
+    index: int,
+    name: str,
+    width: int,
 ) -> Float32:
     """Return the (count, width) values of an accessor; normalised integers become fractions."""
     path = place.path
     accessor = _entry(document.accessors, index, place)
     dtype = np.dtype(_DTYPES.get(accessor.component_type, "V1"))
-    if dtype.kind == "V" or _TYPES.get(accessor.type) != width or accessor.sparse is not None:
+    is_dense = accessor.sparse is None
+    if dtype.kind == "V" or _TYPES.get(accessor.type) != width or not is_dense:
         raise InputError(f"attribute {name!r} has an unsupported type")
-    view = _view(
-        document, accessor.buffer_view, Place(path).to("accessors", index), f"attribute {name!r}"
-    )
+    place = Place(path).to("accessors", index)
+    view = _view(document, accessor.buffer_view, place, f"attribute {name!r}")
     row = width * dtype.itemsize
-    step = row if view.byte_stride is None else view.byte_stride
+    step: int = row
+    if view.byte_stride is not None:
+        step = view.byte_stride
     start = view.byte_offset + accessor.byte_offset
     if step < row:
         raise InputError(f"attribute {name!r} has a stride of {step} bytes, less than its elements")
     count = accessor.count
     if count and start + step * (count - 1) + row > len(binary):
         raise damaged(f"truncated: attribute {name!r} ends past the file")
-    rows = np.ndarray((count, width), dtype, binary, start, (step, dtype.itemsize))
+    rows = np.ndarray(
+        (count, width),
+        dtype,
+        binary,
+        start,
+        strides=(step, dtype.itemsize),
+    )
     values = rows.astype(np.float32)
     if not accessor.normalized:
         return values
-    return np.maximum(values / np.float32(np.iinfo(dtype).max), np.float32(-1))
+    largest = np.float32(np.iinfo(dtype).max)
+    return np.maximum(values / largest, np.float32(-1))
 
 
 def _nodes_shown(path: Path, document: _Document) -> set[int]:
@@ -550,7 +663,8 @@ def _nodes_shown(path: Path, document: _Document) -> set[int]:
     every = set(range(len(document.nodes)))
     if not document.scenes:
         return every
-    ahead = list(_entry(document.scenes, document.scene, Place(path).to("scene")).nodes)
+    scene = _entry(document.scenes, document.scene, Place(path).to("scene"))
+    ahead = list(scene.nodes)
     found = set()
     place = Place(path).to("scenes", document.scene, "nodes")
     while ahead:
@@ -558,15 +672,22 @@ def _nodes_shown(path: Path, document: _Document) -> set[int]:
         if at not in found:
             ahead += _entry(document.nodes, at, place).children
             found.add(int(at))
-    for index, mesh in enumerate(document.meshes):
-        if any(map(_has_splats, mesh.primitives)) and any(
-            document.nodes[at].mesh == index for at in found
-        ):
-            return found
+    meshes = [
+        index
+        for index, mesh in enumerate(document.meshes)
+        if any(map(_has_splats, mesh.primitives))
+    ]
+    if any(document.nodes[at].mesh in meshes for at in found):
+        return found
     return every
 
 
-def _placements(path: Path, nodes: list[_Node], mesh: int, seen: set[int]) -> list[Float]:
+def _placements(
+    path: Path,
+    nodes: list[_Node],
+    mesh: int,
+    seen: set[int],
+) -> list[Float]:
     """Return the (4, 4) placements by a mesh's `seen` nodes and their ancestors, in the axes of a .ply."""
     parents: dict[int, int] = {}
     for i, node in enumerate(nodes):
@@ -576,7 +697,11 @@ def _placements(path: Path, nodes: list[_Node], mesh: int, seen: set[int]) -> li
                 raise InputError(f"node {child} has 2 parents")
     found = []
     holders = [i for i, node in enumerate(nodes) if node.mesh == mesh]
-    for shown in (i for i in holders if i in seen):
+    if not holders:
+        return [np.eye(4)]
+    for shown in holders:
+        if shown not in seen:
+            continue
         at: int | None = shown
         total = np.eye(4)
         above = set()
@@ -591,9 +716,7 @@ def _placements(path: Path, nodes: list[_Node], mesh: int, seen: set[int]) -> li
             raise InputError(f"invalid translation {tuple(total[:3, 3].tolist())}")
         turn = (*_GLTF_TURN, 1)
         found.append(total * np.outer(turn, turn))
-    if holders:
-        return found
-    return [np.eye(4)]
+    return found
 
 
 def _local(node: _Node) -> Float:

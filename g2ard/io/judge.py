@@ -72,19 +72,20 @@ def note_coarse(positions: Values, apart: float) -> Notes:
         return ()
     farthest = np.abs(positions).max(axis=0)
     step = float(np.spacing(farthest.astype(np.float32)).max())
+    if not step > _FINE * apart > 0:
+        return ()
     text = (
         f"coordinates are rounded to steps of {step:g} by float32, which is coarse for points {apart:.2g} "
         "apart; export them as float64 (.las, .laz, .e57), or with a shift (CloudCompare's Global Shift)"
     )
-    if step > _FINE * apart > 0:
-        return (Note("coarse_positions", len(positions), text),)
-    return ()
+    return (Note("coarse_positions", len(positions), text),)
 
 
 def spacing(positions: Values, count: int) -> float:
     """Return the usual distance of `count` neighbours along the two longer sides of most (n, 3) positions."""
     sides = [high - low for low, high in map(bulk_range, positions.T)]
-    return math.sqrt(math.prod(sorted(sides)[1:]) / max(1, count))
+    longer = sorted(sides)[1:]
+    return math.sqrt(math.prod(longer) / max(1, count))
 
 
 def unpack_colors(packed: Values) -> list[Float]:
@@ -98,7 +99,8 @@ def choose_shades(values: Values, limits: tuple[float, float] | None = None) -> 
     low, high = bulk_range(values)
     if limits:
         least, most = limits
-        if least <= low and high <= most and high - low >= _FILLED * (most - least):
+        inside = least <= low and high <= most
+        if inside and high - low >= _FILLED * (most - least):
             return limits
     return low, high
 
@@ -106,9 +108,11 @@ def choose_shades(values: Values, limits: tuple[float, float] | None = None) -> 
 def has_contrast(values: Values) -> bool:
     """Return whether colours (n, 3) are not all black, or intensities (n, 1) vary."""
     finite = values[np.isfinite(values).all(axis=1)]
-    if finite.size:
-        return bool(finite.any() if values.shape[1] == 3 else np.ptp(finite) > 0)
-    return False
+    if not finite.size:
+        return False
+    if values.shape[1] == 3:
+        return bool(finite.any())
+    return bool(np.ptp(finite) > 0)
 
 
 @dataclass(frozen=True)
@@ -141,7 +145,12 @@ class Reading:
 
 @np.errstate(invalid="ignore")  # signalling NaNs
 def judge_storage(
-    scales: Values, opacities: Values, base: Values, *, logs: bool, apart: float = math.inf
+    scales: Values,
+    opacities: Values,
+    base: Values,
+    *,
+    logs: bool,
+    apart: float = math.inf,
 ) -> Reading:
     """Judge how a scene's scales (n, k), opacities (n,) and base colours (n, 3) are stored.
 
@@ -162,49 +171,56 @@ def judge_storage(
         if solid > 1:
             opaque = choose_white(opacities[:, None], full_scales(opacities.dtype))
         if opaque > 1:
-            notes.append(
-                Note("opacities", count, f"opacities are whole numbers, taken as 0 to {opaque:g}")
-            )
-    elif not logs and (faint < -_OUTSIDE or solid > 1 + _OUTSIDE):
+            text = f"opacities are whole numbers, taken as 0 to {opaque:g}"
+            notes.append(Note("opacities", count, text))
+    elif logs:
+        varying = faint < solid or solid == 1
+        if enough and 0 <= faint <= solid <= 1 and varying:
+            told.append(f"opacities ({faint:.3g} to {solid:.3g}) look activated, not logits")
+    elif faint < -_OUTSIDE or solid > 1 + _OUTSIDE:
         opaque = None
         notes.append(Note("opacities", count, "opacities leave [0, 1], so all are taken as logits"))
-    elif logs and enough and 0 <= faint <= solid <= 1 and (faint < solid or solid == 1):
-        told.append(f"opacities ({faint:.3g} to {solid:.3g}) look activated, not logits")
-    elif not logs and (past := int(np.sum(np.abs(opacities - 0.5) > 0.5 + _ROUNDING))):
-        text = f"{plural(past, 'opacity', 'opacities')} past [0, 1] clamped"
-        notes.append(Note("opacities", past, text))
+    else:
+        past = int(np.sum(np.abs(opacities - 0.5) > 0.5 + _ROUNDING))
+        if past:
+            text = f"{plural(past, 'opacity', 'opacities')} past [0, 1] clamped"
+            notes.append(Note("opacities", past, text))
     log_scales = logs
-    unequal = small < large or math.exp(min(small, 1)) > _WIDE * apart
     if not logs and small < 0:
         log_scales = True
-        notes.append(
-            Note("log_scales", count, "scales are below 0, so all are taken as logarithms")
-        )
-    elif (
-        logs and enough and small > 0 and np.mean(scales, where=np.isfinite(scales)) < 1 and unequal
-    ):
-        told.insert(0, f"scales ({small:.3g} to {large:.3g}) look linear, not logarithms")
+        text = "scales are below 0, so all are taken as logarithms"
+        notes.append(Note("log_scales", count, text))
+    elif logs and enough and small > 0:
+        unequal = small < large or math.exp(min(small, 1)) > _WIDE * apart
+        if unequal and np.mean(scales, where=np.isfinite(scales)) < 1:
+            told.insert(0, f"scales ({small:.3g} to {large:.3g}) look linear, not logarithms")
     dark, bright = bulk_range(base)
     full = None
     if dark >= 0 and bright > 1 and _are_whole(base):
         full = choose_white(base, full_scales(base.dtype))
-        notes.append(
-            Note("base_colors", count, f"base colours are whole numbers, taken as 0 to {full:g}")
-        )
+        text = f"base colours are whole numbers, taken as 0 to {full:g}"
+        notes.append(Note("base_colors", count, text))
     elif enough and 0 <= dark < bright - 0.5 and bright <= 1:
         told.append(f"base colours ({dark:.3g} to {bright:.3g}) look like RGB, not coefficients")
     if told:
-        notes.append(
-            Note("activated", 1, f"{' and '.join(told)}; they are read as the format defines them")
-        )
+        text = f"{' and '.join(told)}; they are read as the format defines them"
+        notes.append(Note("activated", 1, text))
     return Reading(log_scales, opaque, full, tuple(notes))
 
 
-def fill_linear(raw: Raw, scales: Values, opacities: Values, base: Values) -> list[Note]:
+def fill_linear(
+    raw: Raw,
+    scales: Values,
+    opacities: Values,
+    base: Values,
+) -> list[Note]:
     """Fill in a scene of a format of linear scales and opacities, as they are judged; return notes."""
     read = judge_storage(scales, opacities, base, logs=False)
     with np.errstate(divide="ignore", invalid="ignore"):
-        raw.log_scales[:] = scales if read.log_scales else np.log(scales.astype(float))
+        if read.log_scales:
+            raw.log_scales[:] = scales
+        else:
+            raw.log_scales[:] = np.log(scales.astype(float))
         raw.logit_opacities[:] = read.opacity_logits(opacities)
         raw.sh0[:, 0] = read.sh0(base)
     return list(read.notes)
@@ -214,6 +230,8 @@ def _are_whole(values: Values) -> bool:
     """Return whether values are whole numbers of a larger range than coefficients and logits have."""
     if values.dtype.kind in "iu":
         return True
-    return bulk_range(values)[1] > _LARGEST_LOGIT and bool(
-        (values == np.rint(values))[np.isfinite(values)].all()
-    )
+    _, high = bulk_range(values)
+    if high <= _LARGEST_LOGIT:
+        return False
+    finite = values[np.isfinite(values)]
+    return bool((finite == np.rint(finite)).all())

@@ -13,22 +13,45 @@ from g2ard.io.types import Noted
 _HEADER = 4096  # bytes of the file's header
 _SECTION = np.dtype(
     [
-        *((name, "<u4") for name in ("count", "capacity", "bucket_size", "buckets")),
-        *(("block", "<f4"), ("bucket_bytes", "<u2"), ("_0", "V2"), ("steps", "<u4"), ("_1", "V4")),
-        *(("full", "<u4"), ("partial", "<u4"), ("degree", "<u2"), ("_2", "V982")),
+        ("count", "<u4"),
+        ("capacity", "<u4"),
+        ("bucket_size", "<u4"),
+        ("buckets", "<u4"),
+        ("block", "<f4"),
+        ("bucket_bytes", "<u2"),
+        ("_0", "V2"),
+        ("steps", "<u4"),
+        ("_1", "V4"),
+        ("full", "<u4"),
+        ("partial", "<u4"),
+        ("degree", "<u2"),
+        ("_2", "V982"),
     ]
 )
 """Header of a section."""
 
-_SH_COUNTS = {0: 0, 1: 9, 2: 24, 3: 45}
+_SH_COUNTS = {
+    0: 0,
+    1: 9,
+    2: 24,
+    3: 45,
+}
+_BANDS = ((0, 9), (9, 24), (24, 45))  # first column of a band, and of the next
 _SH_ORDER = np.concatenate(
-    [np.arange(a, b).reshape(3, -1).T.ravel() for a, b in ((0, 9), (9, 24), (24, 45))]
+    [np.arange(begin, end).reshape(3, -1).T.ravel() for begin, end in _BANDS]
 )
 """Columns of harmonics, which are stored channel after channel per band, in the order of `Splats`."""
 
 _SH_RANGE = (-1.5, 1.5)  # range of 8-bit harmonics if the header gives none
 # half of the steps of a 16-bit position within its bucket, if a section gives none
 _SCALE_RANGE = 32767
+
+_KINDS = (
+    ("<f4", "<f4", "<f4"),
+    ("<u2", "<f2", "<f2"),
+    ("<u2", "<f2", "u1"),
+)
+"""Types of positions, of scales and rotations, and of harmonics, by level of compression."""
 
 
 def read(path: Path) -> Noted:
@@ -57,19 +80,29 @@ def read(path: Path) -> Noted:
         raise damaged(f"is cut off within the headers of {sections} sections")
     parts = []
     for i in range(sections):
-        raw, at = _rows(data, i, at, _section(data, i), level, limits)
+        raw, at = _rows(
+            data,
+            i,
+            at,
+            _section(data, i),
+            level,
+            limits,
+        )
         parts.append(raw)
     rest = max((raw.shN.shape[1] for raw in parts), default=0)
     whole = Raw.empty(sum(len(raw.means) for raw in parts), rest)
     start = 0
     whole.shN[:] = 0
     for raw in parts:
-        whole.take(slice(start, start := start + len(raw.means))).fill(vars(raw).values())
+        rows = slice(start, start + len(raw.means))
+        whole.take(rows).fill(vars(raw).values())
+        start = rows.stop
     return cleaned(whole)
 
 
 def _section(data: bytes, i: int) -> dict[str, Any]:
-    values = np.frombuffer(data, _SECTION, 1, _HEADER + i * _SECTION.itemsize)[0].item()
+    at = _HEADER + i * _SECTION.itemsize
+    values = np.frombuffer(data, _SECTION, 1, at)[0].item()
     section = dict(zip(_SECTION.names or (), values, strict=True))
     if section["degree"] not in _SH_COUNTS:
         text = f"has the unsupported SH degree {section['degree']}; expected 0 to 3"
@@ -78,20 +111,24 @@ def _section(data: bytes, i: int) -> dict[str, Any]:
 
 
 def _rows(
-    data: bytes, i: int, at: int, section: dict[str, Any], level: int, limits: tuple[float, ...]
+    data: bytes,
+    i: int,
+    at: int,
+    section: dict[str, Any],
+    level: int,
+    limits: tuple[float, ...],
 ) -> tuple[Raw, int]:
     """Return the rows of section `i`, which begins at byte `at`, and the byte after it."""
-    packed = "<f4" if level == 0 else "<u2"
-    real = "<f4" if level == 0 else "<f2"
+    mean, real, sh = _KINDS[level]
     harmonics = _SH_COUNTS[section["degree"]]
     count = min(section["count"], section["capacity"])
     row = np.dtype(
         [
-            ("mean", packed, 3),
+            ("mean", mean, 3),
             ("scale", real, 3),
             ("quat", real, 4),
             ("rgba", "u1", 4),
-            ("sh", "u1" if level == 2 else real, (harmonics,)),
+            ("sh", sh, (harmonics,)),
         ]
     )
     begin = at + 4 * section["partial"] + section["bucket_bytes"] * section["buckets"]
@@ -100,7 +137,10 @@ def _rows(
         raise damaged("is cut off", index=i, item="section")
     rows = np.frombuffer(data, row, count, begin)
     raw = Raw.empty(count, harmonics // 3)
-    raw.means[:] = rows["mean"] if level == 0 else _centres(data, i, at, section, rows["mean"])
+    if level == 0:
+        raw.means[:] = rows["mean"]
+    else:
+        raw.means[:] = _centres(data, i, at, section, rows["mean"])
     raw.set_linear(rows["scale"], rows["rgba"])
     raw.quats[:] = rows["quat"]
     values = rows["sh"].astype(float)
@@ -110,19 +150,28 @@ def _rows(
     return raw, end
 
 
-def _centres(data: bytes, i: int, at: int, section: dict[str, Any], steps: Values) -> Float:
+def _centres(
+    data: bytes,
+    i: int,
+    at: int,
+    section: dict[str, Any],
+    steps: Values,
+) -> Float:
     """Return positions from 16-bit steps: full buckets first, then partial ones of the listed lengths."""
-    full, partial, buckets, size = (
-        section[k] for k in ("full", "partial", "buckets", "bucket_bytes")
-    )
+    full = section["full"]
+    partial = section["partial"]
+    buckets = section["buckets"]
+    size = section["bucket_bytes"]
     if size < 12 or full + partial != buckets:
         raise damaged("has inconsistent buckets", index=i, item="section")
-    lengths = np.frombuffer(data, "<u4", partial, at).astype(np.int64)
-    lengths = np.concatenate([np.full(full, section["bucket_size"], np.int64), lengths])
+    lengths = np.full(full + partial, section["bucket_size"], np.int64)
+    lengths[full:] = np.frombuffer(data, "<u4", partial, at)
     if lengths.sum() < len(steps):
         raise damaged("has more rows than its buckets hold", index=i, item="section")
     table = np.frombuffer(data, "u1", buckets * size, at + 4 * partial).reshape(buckets, size)
     centres = np.ascontiguousarray(table[:, :12]).view("<f4").astype(float)
-    bucket = np.repeat(np.arange(buckets), np.minimum(lengths, len(steps)))[: len(steps)]
+    count = len(steps)
+    bucket = np.repeat(np.arange(buckets), np.minimum(lengths, count))[:count]
     half = section["steps"] or _SCALE_RANGE
-    return (steps.astype(float) - half) * (section["block"] / 2 / half) + centres[bucket]
+    step = section["block"] / 2 / half
+    return (steps.astype(float) - half) * step + centres[bucket]

@@ -35,10 +35,12 @@ def writable(splats: Splats) -> Splats:
 def own_place(stored: Splats) -> Json:
     """Return what a file states under "g2ard" of a scene `as_stored`: axes, and the offset in these axes."""
     offset = moved_axes(stored.offset, "RDF", stored.axes)
-    own: Json = {"offset": offset.tolist()} if offset.any() else {}
-    if stored.axes == "RDF":
-        return own
-    return {**own, "axes": stored.axes}
+    own: Json = {}
+    if offset.any():
+        own["offset"] = offset.tolist()
+    if stored.axes != "RDF":
+        own["axes"] = stored.axes
+    return own
 
 
 def rounding(splats: Splats, stored: Splats | Float) -> float:
@@ -52,7 +54,8 @@ def rounding(splats: Splats, stored: Splats | Float) -> float:
         world = stored.means + (stored.offset - splats.offset)
     else:
         world = stored - splats.offset
-    return float(np.nanmax(np.abs(world - splats.means)))
+    changes = np.abs(world - splats.means)
+    return float(np.nanmax(changes))
 
 
 def as_packed(splats: Splats) -> Splats:
@@ -77,7 +80,8 @@ def packing_order(means: Values, chunk: int = 1) -> Rows:
     >>> packing_order(np.array([[1.0, 1, 1], [0, 0, 0], [0.9, 1, 1]])).tolist()
     [1, 2, 0]
     """
-    away = np.linalg.norm(means.astype(float) - np.median(means, axis=0), axis=1)
+    from_median = means.astype(float) - np.median(means, axis=0)
+    away = np.linalg.norm(from_median, axis=1)
     near = _NEAR * np.percentile(away, 75)
     if not near > 0 or away.max() < near:
         return morton_order(means)
@@ -86,8 +90,11 @@ def packing_order(means: Values, chunk: int = 1) -> Rows:
     outwards = np.argsort(away, kind="stable")
     ends = np.cumsum(np.bincount(shells)) // chunk * chunk
     ends = np.unique([0, *ends[:-1], len(means)])
-    groups = (np.sort(outwards[a:b]) for a, b in pairwise(ends))
-    return np.concatenate([rows[morton_order(means[rows])] for rows in groups])
+    ordered = []
+    for begin, end in pairwise(ends):
+        rows = np.sort(outwards[begin:end])
+        ordered.append(rows[morton_order(means[rows])])
+    return np.concatenate(ordered)
 
 
 def morton_order(means: Values) -> Rows:
@@ -95,22 +102,28 @@ def morton_order(means: Values) -> Rows:
     low = means.min(axis=0).astype(float)
     high = means.max(axis=0).astype(float)
     size = max(float((high - low).max()), np.finfo(float).tiny)
-    cells = ((means - low) / size * ((1 << _MORTON_BITS) - 1)).astype(np.uint64)
+    last = (1 << _MORTON_BITS) - 1
+    cells = ((means - low) / size * last).astype(np.uint64)
     code = np.zeros(len(means), np.uint64)
     for axis in range(3):
         code |= _spread(cells[:, axis]) << np.uint64(axis)
     return np.argsort(code, kind="stable")
 
 
+_SPREADING = (
+    (32, 0x001F00000000FFFF),
+    (16, 0x001F0000FF0000FF),
+    (8, 0x100F00F00F00F00F),
+    (4, 0x10C30C30C30C30C3),
+    (2, 0x1249249249249249),
+)
+"""Shifts and masks that put two zeros after each bit."""
+
+
 def _spread(v: Values) -> Values:
-    for shift, mask in (
-        (32, 0x001F00000000FFFF),
-        (16, 0x001F0000FF0000FF),
-        (8, 0x100F00F00F00F00F),
-        (4, 0x10C30C30C30C30C3),
-        (2, 0x1249249249249249),
-    ):
-        v = (v | v << np.uint64(shift)) & np.uint64(mask)
+    for shift, mask in _SPREADING:
+        shifted = v << np.uint64(shift)
+        v = (v | shifted) & np.uint64(mask)
     return v
 
 
@@ -124,7 +137,8 @@ def log_scales(splats: Splats) -> Float:
 def unit_quats(quats: Values) -> Float:
     """Normalise (N, 4) quaternions; zeros become the identity."""
     q = quats.astype(float)
-    q /= np.maximum(np.abs(q).max(axis=1, keepdims=True), np.finfo(float).tiny)
+    largest = np.abs(q).max(axis=1, keepdims=True)
+    q /= np.maximum(largest, np.finfo(float).tiny)
     norms = np.linalg.norm(q, axis=1, keepdims=True)
     return np.where(norms > 0, q / np.maximum(norms, 0.5), [1.0, 0, 0, 0])
 
@@ -142,7 +156,8 @@ def smallest_three(quats: Float) -> tuple[Rows, Float]:
     rows = np.arange(len(quats))
     signs = np.where(quats[rows, largest] < 0, -1.0, 1.0)
     signed = quats * signs[:, None]
-    return largest, signed[rows[:, None], _OTHER_COMPONENTS[largest]] + 0.0
+    others = signed[rows[:, None], _OTHER_COMPONENTS[largest]]
+    return largest, others + 0.0  # no −0
 
 
 def from_smallest_three(largest: Values, others: Float) -> Float:

@@ -54,20 +54,31 @@ class Stream(RawStream):
         groups = plyfiles.groups_of(header)
         names = plyfiles.scene_names(header.properties(groups[-1]))
         mode = plyfiles.render_model_of(header.comments)
-        rgb = next((names_ for names_ in plyfiles.COLOR_NAMES if set(names_) <= set(names)), None)
-        self._rgb = rgb if rgb and not any(name in names for name in _DC) else None
+        self._rgb: tuple[str, ...] | None = None
+        if names.keys().isdisjoint(_DC):
+            choices = (rgb for rgb in plyfiles.COLOR_NAMES if names.keys() >= set(rgb))
+            self._rgb = next(choices, None)
         if "scale" in names and "scale_0" not in names:
             names["scale_0"] = names.pop("scale")
         flat = mode == "2dgs" or ("scale_1" in names and "scale_2" not in names)
-        one = "scale_0" in names and not {"scale_1", "scale_2"} & set(names)
-        self._scales = _SCALES[: 2 if flat else 1 if one else 3]
-        round_ones = len(self._scales) == 1 and not any(name in names for name in _QUATS)
-        self._quats = [] if round_ones else _QUATS
-        needed = [*_MEANS, *(self._rgb or _DC), "opacity", *self._scales, *self._quats]
+        self._scales = _SCALES
+        if flat:
+            self._scales = _SCALES[:2]
+        elif "scale_0" in names and names.keys().isdisjoint(_SCALES[1:]):
+            self._scales = _SCALES[:1]
+        self._quats = _QUATS
+        if len(self._scales) == 1 and names.keys().isdisjoint(_QUATS):
+            self._quats = []
+        needed = [
+            *_MEANS,
+            *(self._rgb or _DC),
+            "opacity",
+            *self._scales,
+            *self._quats,
+        ]
         plyfiles.require(list(names), needed, "a 3DGS scene")
-        rest = sorted(
-            (p for p in names if re.fullmatch(r"f_rest_\d{1,3}", p)), key=lambda p: int(p[7:])
-        )
+        rest = [name for name in names if re.fullmatch(r"f_rest_\d{1,3}", name)]
+        rest.sort(key=_rest_number)
         stored, kept = _bands(rest)
         rows = _joined(plyfiles.read_element(path, header, *groups))
         self._names = names
@@ -82,17 +93,25 @@ class Stream(RawStream):
         moving += [name for name in _DEFORMS if (path.absolute().parent / name).exists()]
         unused = [name for name in names if name not in needed]
         notes = [*_frames(header), *_ignored(unused, rest, stored, kept)]
-        told = {
-            "moving": (
-                len(moving),
-                f"the scene moves in time ({some(moving)}); all times are read as one",
-            ),
-            "flat_gaussians": (flat * len(rows), _FLAT),
-            "mip_filter": ((_FILTER in names) * len(rows), _FILTERED),
-        }
-        notes += [Note(code, count, text) for code, (count, text) in told.items() if count]
-        model: RenderModel = "antialiased" if mode == "antialiased" and not flat else "classic"
-        super().__init__(path, len(rows), kept, offset, tuple(notes), model)
+        if moving:
+            text = f"the scene moves in time ({some(moving)}); all times are read as one"
+            notes.append(Note("moving", len(moving), text))
+        count = len(rows)
+        if flat and count:
+            notes.append(Note("flat_gaussians", count, _FLAT))
+        if _FILTER in names and count:
+            notes.append(Note("mip_filter", count, _FILTERED))
+        model: RenderModel = "classic"
+        if mode == "antialiased" and not flat:
+            model = mode
+        super().__init__(
+            path,
+            count,
+            kept,
+            offset,
+            tuple(notes),
+            model,
+        )
         self.up = plyfiles.up_of(header.comments)
         self.restore(plyfiles.axes_of(header))
         self._shift = shift
@@ -123,7 +142,9 @@ class Stream(RawStream):
 
     def _means(self, block: Values) -> Float32:
         means = self._columns(block, _MEANS)
-        return np.asarray(means - self._shift if self._shift.any() else means, np.float32)
+        if self._shift.any():
+            means = means - self._shift
+        return np.asarray(means, np.float32)
 
     def _judged(self) -> tuple[Reading, float]:
         """Return how values are stored, and the number that means white in RGB."""
@@ -131,15 +152,19 @@ class Stream(RawStream):
         scales = self._columns(rows, self._scales)
         base = self._columns(rows, self._rgb or _DC)
         opacities = rows[self._names["opacity"]]
+        wide = 0.0
         with np.errstate(over="ignore", invalid="ignore"):
-            wide = 2 * np.exp(np.median(scales)) if len(rows) else 0.0
+            if len(rows):
+                wide = float(2 * np.exp(np.median(scales)))
         means = self._columns(rows, _MEANS)
-        self.notes += note_coarse(means, float(wide))
+        self.notes += note_coarse(means, wide)
+        white = 1.0
+        if self._rgb is not None:
+            white = choose_white(base, full_scales(base.dtype))
+            base = np.zeros((0, 3))
         apart = spacing(means, self.count)
-        if self._rgb is None:
-            return judge_storage(scales, opacities, base, logs=True, apart=apart), 1.0
-        full = choose_white(base, full_scales(base.dtype))
-        return judge_storage(scales, opacities, np.zeros((0, 3)), logs=True, apart=apart), full
+        reading = judge_storage(scales, opacities, base, logs=True, apart=apart)
+        return reading, white
 
     def _decode(self, block: Values, raw: Raw) -> None:
         raw.means[:] = self._means(block)
@@ -157,7 +182,9 @@ class Stream(RawStream):
             quats = self._columns(block, self._quats)
         else:
             quats = np.array([[1.0, 0, 0, 0]])
-        raw.quats[:] = quats - (128.0 if quats.dtype == np.uint8 else 0.0)  # of bytes, 128 is 0
+        if quats.dtype == np.uint8:  # of bytes, 128 is 0
+            quats = quats - 128.0
+        raw.quats[:] = quats
         raw.logit_opacities[:] = self._read.opacity_logits(block[self._names["opacity"]])
         if _FILTER in self._names:
             _widen(raw, np.asarray(block[self._names[_FILTER]], float))
@@ -173,19 +200,28 @@ def _joined(groups: list[Values]) -> Values:
         return groups[0]
     rows = np.zeros(sum(map(len, groups)), groups[-1].dtype)
     at = 0
-    most = sum(name.startswith("f_rest_") for name in rows.dtype.names or ()) // 3
+    most = _count_bands(rows)
     for group in groups:
-        names = group.dtype.names or ()
-        own = sum(name.startswith("f_rest_") for name in names) // 3
+        own = _count_bands(group)
         here = rows[at : at + len(group)]
-        for name in names:
+        for name in group.dtype.names or ():
             target = name
             if name.startswith("f_rest_"):  # harmonics are stored channel after channel
-                channel, k = divmod(int(name[7:]), own)
+                channel, k = divmod(_rest_number(name), own)
                 target = f"f_rest_{channel * most + k}"
             here[target] = group[name]
         at += len(group)
     return rows
+
+
+def _count_bands(rows: Values) -> int:
+    """Return the number of coefficients past band 0 per channel."""
+    names = rows.dtype.names or ()
+    return sum(name.startswith("f_rest_") for name in names) // 3
+
+
+def _rest_number(name: str) -> int:
+    return int(name.removeprefix("f_rest_"))
 
 
 def _widen(raw: Raw, size: Float) -> None:
@@ -207,9 +243,10 @@ def _frames(header: plyfiles.PlyHeader) -> list[Note]:
     """Return a note on elements with changes of the Gaussians over time."""
     count = header.counts.get("vertex")
     groups = plyfiles.groups_of(header)
-    moving = [
-        name for name, rows in header.counts.items() if name not in groups and rows == count != 1
-    ]
+    if count == 1:
+        return []
+    others = [name for name in header.counts if name not in groups]
+    moving = [name for name in others if header.counts[name] == count]
     if not moving:
         return []
     what = plural(len(moving), "further element")
@@ -220,20 +257,24 @@ def _frames(header: plyfiles.PlyHeader) -> list[Note]:
 def _bands(rest: list[str]) -> tuple[int, int]:
     """Return the numbers of stored and of kept coefficients past band 0 per channel."""
     count = len(rest)
-    numbers = [int(name[7:]) for name in rest]
+    numbers = list(map(_rest_number, rest))
     if numbers != list(range(count)) or count not in (0, 9, 24, 45, 72):
         raise InputError(f"expected f_rest_0 to f_rest_n with 0, 9, 24 or 45 of them, got {count}")
     return count // 3, min(count // 3, 15)
 
 
-def _ignored(unused: list[str], rest: list[str], stored: int, kept: int) -> list[Note]:
+def _ignored(
+    unused: list[str],
+    rest: list[str],
+    stored: int,
+    kept: int,
+) -> list[Note]:
     known = {*_REQUIRED_PROPERTIES, *_NORMALS, *rest, _FILTER}
     extra = [name for name in unused if name not in known]
     notes = []
     if extra:
-        text = (
-            f"{plural(len(extra), 'extra property', 'extra properties')} ignored ({some(extra, 4)})"
-        )
+        what = plural(len(extra), "extra property", "extra properties")
+        text = f"{what} ignored ({some(extra, 4)})"
         notes.append(Note("ignored_properties", len(extra), text))
     if stored > kept:
         notes.append(Note("ignored_bands", 1, "spherical harmonics past degree 3 ignored"))
@@ -260,8 +301,10 @@ def write(
         The largest change of a position by rounding.
     """
     require("layout", repr(layout), layout in (None, "inria"), "'inria' or None")
-    normals = normals or layout == "inria"
-    degree = 3 if layout == "inria" else scene.sh_degree
+    degree = scene.sh_degree
+    if layout == "inria":
+        normals = True
+        degree = 3
     error = 0.0
     if isinstance(scene, Splats):
         error = rounding(scene, scene.narrowed())
@@ -274,14 +317,19 @@ def write(
         parts = map(as_stored, scene.blocks(BLOCK))
     if not count:
         raise InputError("not written: the scene has no Gaussians", path=path)
-    names = [*_MEANS, *(_NORMALS if normals else []), *_DC]
-    names += [f"f_rest_{k}" for k in range(3 * ((degree + 1) ** 2 - 1))]
+    names = list(_MEANS)
+    if normals:
+        names += _NORMALS
+    names += _DC
+    coefficients = 3 * ((degree + 1) ** 2 - 1)
+    names += [f"f_rest_{k}" for k in range(coefficients)]
     names += ["opacity", *_SCALES, *_QUATS]
     blocks = _blocks((part.with_sh_degree(degree) for part in parts), names, normals)
     comments = plyfiles.comments_of(frame)
     if layout == "inria":
         comments = comments[1:]  # those that carry values: importers by position may count lines
-    plyfiles.write_rows(path, dict.fromkeys(names, "<f4"), count, blocks, overwrite, comments)
+    types = dict.fromkeys(names, "<f4")
+    plyfiles.write_rows(path, types, count, blocks, overwrite, comments)
     return error
 
 
@@ -290,22 +338,32 @@ def _taken_apart(splats: Splats) -> Iterator[Splats]:
     return (splats.take(slice(at, at + BLOCK)) for at in range(0, len(splats), BLOCK))
 
 
-def _blocks(parts: Iterable[Splats], names: list[str], normals: bool) -> Iterator[Float32]:
+def _blocks(
+    parts: Iterable[Splats],
+    names: list[str],
+    normals: bool,
+) -> Iterator[Float32]:
     first = 0
     for block in chain.from_iterable(map(_taken_apart, parts)):
         n = len(block)
         with np.errstate(divide="ignore", invalid="ignore"):
             logs = np.clip(np.log(block.scales, dtype=float), -LOG_SCALE_LIMIT, LOG_SCALE_LIMIT)
-        columns = [
-            block.means,
-            np.zeros((n, 3 if normals else 0)),
+        columns = [block.means]
+        if normals:
+            columns.append(np.zeros((n, 3)))
+        columns += [
             block.sh0[:, 0],
             block.shN.transpose(0, 2, 1).reshape(n, -1),
             block.logit_opacities[:, None],
             logs,
             unit_quats(block.quats),
         ]
-        rows = np.concatenate(columns, axis=1, dtype="<f4", casting="same_kind")
+        rows = np.concatenate(
+            columns,
+            axis=1,
+            dtype="<f4",
+            casting="same_kind",
+        )
         finite = np.isfinite(rows)
         if not finite.all():
             row, column = np.argwhere(~finite)[0]

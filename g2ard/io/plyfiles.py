@@ -31,10 +31,12 @@ _RENDER_MODES: dict[str, RenderModel | Literal["2dgs"]] = {
 }
 """Comments of brush and Postshot, in lower case."""
 
+_CHANNELS = (("red", "green", "blue"), ("r", "g", "b"), ("rf", "gf", "bf"))
+_COLOR_PREFIXES = ("", "diffuse_", "color_", "vertex_")
 COLOR_NAMES = [
-    tuple(f"{prefix}{name}" for name in names)
-    for names in (("red", "green", "blue"), "rgb", ("rf", "gf", "bf"))
-    for prefix in ("", "diffuse_", "color_", "vertex_")
+    tuple(prefix + channel for channel in channels)
+    for channels in _CHANNELS
+    for prefix in _COLOR_PREFIXES
 ]
 """Names of colours."""
 
@@ -62,9 +64,8 @@ class PlyHeader:
         """Return the properties of an element that are no lists; none if there is no such element."""
         if element not in self.elements:
             return []
-        return [
-            p.name for p in self.elements[element].properties if not isinstance(p, PlyListProperty)
-        ]
+        properties = self.elements[element].properties
+        return [each.name for each in properties if not isinstance(each, PlyListProperty)]
 
 
 def read_header(path: Path) -> PlyHeader:
@@ -75,7 +76,9 @@ def read_header(path: Path) -> PlyHeader:
 def _header(head: bytes) -> PlyHeader:
     if not head:
         raise InputError("is empty")
-    start = len(_MARK) if head.startswith(_MARK) else 0
+    start = 0
+    if head.startswith(_MARK):
+        start = len(_MARK)
     head = head[start:]
     if head[:3] != b"ply" or head[3:4] not in b"\r\n":
         raise InputError(
@@ -85,7 +88,9 @@ def _header(head: bytes) -> PlyHeader:
     end = _END_HEADER.search(head)  # on a line of its own, since comments may contain it
     if end is None:
         raise damaged("broken PLY header: no end_header line")
-    eol = b"\r\n" if head[3:5] == b"\r\n" else head[3:4]
+    eol = head[3:4]
+    if head[3:5] == b"\r\n":
+        eol = b"\r\n"
     head = head[: end.start(1) + len(eol)]  # rows may begin with a newline
     span = range(start, start + len(head))
     head = head.translate(_ASCII)
@@ -94,8 +99,11 @@ def _header(head: bytes) -> PlyHeader:
         ply = PlyData.read(io.BytesIO(_COUNT.sub(rb"\g<1>0", head)), mmap=False)
     except (PlyParseError, ValueError) as error:
         raise damaged(f"broken PLY header, {error}") from error
-    comments = [*ply.comments, *(text for element in ply for text in element.comments)]
-    return PlyHeader(ply, counts, [" ".join(text.split()) for text in comments], span)
+    comments = list(ply.comments)
+    for element in ply:
+        comments += element.comments
+    comments = [" ".join(text.split()) for text in comments]
+    return PlyHeader(ply, counts, comments, span)
 
 
 class _Plain(io.BufferedReader):
@@ -108,10 +116,9 @@ class _Plain(io.BufferedReader):
 
     def read(self, size: int | None = -1, /) -> bytes:
         data = super().read(size)
-        within = self.tell() <= self._end
-        if not within:
-            return data
-        return data.translate(_ASCII)
+        if self.tell() <= self._end:
+            return data.translate(_ASCII)
+        return data
 
 
 def scene_names(properties: Sequence[str]) -> dict[str, str]:
@@ -145,14 +152,16 @@ def offset_of(header: PlyHeader) -> Float:
     The comment is in the axes of a comment `g2ard axes`, so it holds coordinates of the map.
     """
     for comment in header.comments:
-        if match := _OFFSET_COMMENT.match(comment):
-            try:
-                offset = np.array([float(word) for word in match.groups()])
-            except ValueError:
-                offset = np.full(3, np.nan)
-            if not np.isfinite(offset).all():
-                raise damaged(f"broken comment {comment!r}")
-            return moved_axes(offset, axes_of(header), "RDF")
+        match = _OFFSET_COMMENT.match(comment)
+        if match is None:
+            continue
+        try:
+            offset = np.array([float(word) for word in match.groups()])
+        except ValueError:
+            offset = np.full(3, np.nan)
+        if not np.isfinite(offset).all():
+            raise damaged(f"broken comment {comment!r}")
+        return moved_axes(offset, axes_of(header), "RDF")
     return np.zeros(3)
 
 
@@ -175,10 +184,11 @@ def render_model_of(comments: Sequence[str]) -> RenderModel | Literal["2dgs"]:
     >>> render_model_of(["Exported from Brush", "SplatRenderMode: default"])
     'classic'
     """
-    modes = [_RENDER_MODES[text] for c in comments if (text := c.lower()) in _RENDER_MODES]
-    if not modes:
-        return "classic"
-    return modes[-1]
+    for comment in reversed(comments):
+        text = comment.lower()
+        if text in _RENDER_MODES:
+            return _RENDER_MODES[text]
+    return "classic"
 
 
 def up_of(comments: Sequence[str]) -> tuple[float, float, float] | None:
@@ -193,20 +203,25 @@ def up_of(comments: Sequence[str]) -> tuple[float, float, float] | None:
     >>> up_of(["Exported from Brush", "Vertical axis: z"])
     (0.0, 0.0, -1.0)
     """
-    found = next((m for c in reversed(comments) if (m := _VERTICAL_AXIS.match(c))), None)
+    matches = filter(None, map(_VERTICAL_AXIS.match, reversed(comments)))
+    found = next(matches, None)
     if found is None:
         return None
     axis = np.zeros(3)
     letter = re.fullmatch(r"([+-]?)([xyz])", found[2].lower())
     if letter:
         writers = " ".join(comments).lower()
-        named = "brush" in writers or not re.search("nerf?studio", writers)
-        by_brush = named and ("brush" in writers or found[1] == "a")
-        down = by_brush and letter[2] != "x"
-        axis["xyz".index(letter[2])] = -1 if down != (letter[1] == "-") else 1
+        by_brush = "brush" in writers
+        if not by_brush and not re.search("nerf?studio", writers):
+            by_brush = found[1] == "a"
+        is_down = by_brush and letter[2] != "x"
+        if letter[1] == "-":
+            is_down = not is_down
+        axis["xyz".index(letter[2])] = -1 if is_down else 1
     else:
+        words = re.split(r"[\s,]+", found[2].strip("[]() "))
         with suppress(ValueError):
-            axis[:] = [float(word) for word in re.split(r"[\s,]+", found[2].strip("[]() "))]
+            axis[:] = [float(word) for word in words]
     length = float(np.linalg.norm(axis))
     if not 0 < length < np.inf:
         return None
@@ -221,13 +236,24 @@ def comments_of(stored: Splats) -> list[str]:
         comments.append(f"g2ard axes {stored.axes}")
     if stored.offset.any():
         offset = moved_axes(stored.offset, "RDF", stored.axes)
-        comments.append("g2ard offset " + " ".join(repr(float(v)) for v in offset))
+        comments.append(f"g2ard offset {_spell_out(offset)}")
     if stored.up is not None:
-        comments.append("Vertical axis: " + " ".join(repr(float(v)) for v in stored.up))
-    return comments + (["SplatRenderMode: mip"] if stored.render_model == "antialiased" else [])
+        comments.append(f"Vertical axis: {_spell_out(stored.up)}")
+    if stored.render_model == "antialiased":
+        comments.append("SplatRenderMode: mip")
+    return comments
 
 
-def read_element(path: Path, header: PlyHeader, *names: str, plain: bool = False) -> list[Values]:
+def _spell_out(numbers: Iterable[float]) -> str:
+    return " ".join(repr(float(number)) for number in numbers)
+
+
+def read_element(
+    path: Path,
+    header: PlyHeader,
+    *names: str,
+    plain: bool = False,
+) -> list[Values]:
     """Return an array of rows per element name, memory-mapped if the file is binary.
 
     Lists are first read as triangles, since lists of a known length can be mapped; if a polygon has another
@@ -237,10 +263,10 @@ def read_element(path: Path, header: PlyHeader, *names: str, plain: bool = False
     for name, count in header.counts.items():  # before allocating memory: a row has at least a byte
         if count > size:
             raise damaged(f"truncated: {count:,} rows of {name!r} in {size:,} bytes")
-    triangles = {
-        element.name: {p.name: 3 for p in element.properties if isinstance(p, PlyListProperty)}
-        for element in header.elements
-    }
+    triangles = {}
+    for element in header.elements:
+        lists = [each for each in element.properties if isinstance(each, PlyListProperty)]
+        triangles[element.name] = {each.name: 3 for each in lists}
     try:
         try:
             ply = _read(path, header, triangles, plain)
@@ -272,18 +298,22 @@ def _check_rest(path: Path, end: int) -> None:
         file.seek(end)
         if not file.read(_HEADER_LIMIT).strip(b"\0\r\n\t "):
             return
-    text = f"has {path.stat().st_size - end:,} bytes after its last row: a transfer as text changed line ends"
+    rest = path.stat().st_size - end
+    text = f"has {rest:,} bytes after its last row: a transfer as text changed line ends"
     raise InputError(f"{text}, or its header states too few rows", hint=AGAIN)
 
 
 def _read(
-    path: Path, header: PlyHeader, list_lengths: dict[str, dict[str, int]], plain: bool = False
+    path: Path,
+    header: PlyHeader,
+    list_lengths: dict[str, dict[str, int]],
+    plain: bool = False,
 ) -> PlyData:
     with _Plain(path, header.span) as file:
         if plain:
             head = file.read(len(header.span))
-            body = file.read().decode("latin-1")
-            return PlyData.read(io.BytesIO(head + plain_numbers(body).encode("latin-1")))
+            body = plain_numbers(file.read().decode("latin-1"))
+            return PlyData.read(io.BytesIO(head + body.encode("latin-1")))
         return PlyData.read(file, mmap="r", known_list_len=list_lengths)
 
 
@@ -310,7 +340,10 @@ def write_rows(
 
 
 def row_blocks(
-    path: Path, every: Values, rows: int, start: int = 0
+    path: Path,
+    every: Values,
+    rows: int,
+    start: int = 0,
 ) -> Iterator[tuple[int, Values]]:
     """Yield an element's rows from `start` in blocks of `rows`, each with the index of its first row.
 
@@ -321,7 +354,8 @@ def row_blocks(
         if not isinstance(every, np.memmap):
             yield first, every[first : first + count]
             continue
-        block = np.fromfile(path, every.dtype, count, offset=every.offset + first * every.itemsize)
+        offset = every.offset + first * every.itemsize
+        block = np.fromfile(path, every.dtype, count, offset=offset)
         if len(block) < count:
             raise InputError("was truncated while it was read", path=path)
         yield first, block
@@ -343,7 +377,12 @@ def spread_rows(rows: Values, count: int = 100_000) -> Values:
     return np.frombuffer(b"".join(parts), rows.dtype)
 
 
-def require(present: list[str], wanted: list[str], what: str, element: str = "vertex") -> None:
+def require(
+    present: list[str],
+    wanted: list[str],
+    what: str,
+    element: str = "vertex",
+) -> None:
     """Raise an `InputError` that lists the `wanted` properties that are not `present`."""
     missing = [name for name in wanted if name not in present]
     if missing:

@@ -47,7 +47,14 @@ class Raw:
         def room(*shape: int) -> Float32:
             return np.empty((count, *shape), np.float32)
 
-        return cls(room(3), room(4), room(3), room(), room(1, 3), room(rest, 3))
+        return cls(
+            means=room(3),
+            quats=room(4),
+            log_scales=room(3),
+            logit_opacities=room(),
+            sh0=room(1, 3),
+            shN=room(rest, 3),
+        )
 
     def take(self, rows: slice) -> Raw:
         """Return a view of some rows."""
@@ -66,14 +73,31 @@ class Raw:
             self.log_scales[:] = np.log(scales.astype(float))
             self.logit_opacities[:] = logits_of(shown[:, 3])
 
-    def activated(self, render_model: RenderModel, offset: Float, axis: _Up = None) -> Splats:
+    def activated(
+        self,
+        render_model: RenderModel,
+        offset: Float,
+        axis: _Up = None,
+    ) -> Splats:
         """Return the scene, after `Tally.clean` has exponentiated `log_scales` in place."""
         means, quats, scales, logits, sh0, shN = vars(self).values()
-        return Splats(means, quats, scales, logits, sh0, shN, offset, render_model, axis)
+        return Splats(
+            means,
+            quats,
+            scales,
+            logits,
+            sh0,
+            shN,
+            offset,
+            render_model,
+            axis,
+        )
 
 
 def cleaned(
-    raw: Raw, notes: list[Note] | None = None, render_model: RenderModel = "classic"
+    raw: Raw,
+    notes: list[Note] | None = None,
+    render_model: RenderModel = "classic",
 ) -> Noted:
     """Check, clamp and activate a scene, whose arrays become those of the result.
 
@@ -85,7 +109,9 @@ def cleaned(
     keep = tally.clean(raw)
     notes = [*(notes or ()), *tally.notes()]
     splats = raw.activated(render_model, np.zeros(3))
-    return splats.take(keep) if tally.dropped else splats, tuple(notes)
+    if tally.dropped:
+        splats = splats.take(keep)
+    return splats, tuple(notes)
 
 
 @dataclass
@@ -117,7 +143,7 @@ class Tally:
 
     def _count(self, good: Mask) -> None:
         """Count rows, given an (n,) mask of those that are finite."""
-        lost = len(good) - int(np.count_nonzero(good))
+        lost = int(np.count_nonzero(~good))
         if lost and not self.dropped:
             self.first = self.rows + int(np.argmin(good))
         self.dropped += lost
@@ -159,7 +185,8 @@ class Tally:
         for values in (raw.means, quats, raw.sh0, raw.shN):
             good &= _finite_rows(values)
 
-        self.logits += int(np.count_nonzero(good & (np.abs(logits) > LOGIT_LIMIT)))
+        beyond = np.abs(logits) > LOGIT_LIMIT
+        self.logits += int(np.count_nonzero(beyond & good))
         np.clip(logits, -LOGIT_LIMIT, LOGIT_LIMIT, out=logits)
         beyond = np.abs(scales) > LOG_SCALE_LIMIT
         self.scales += int(np.count_nonzero(beyond[good]))
@@ -185,10 +212,11 @@ class Tally:
         if not self.rows:
             raise InputError(f"has no {self.item}s", path=path)
         if not left:
-            hint = None if points else "use an earlier checkpoint of the training"
-            raise InputError(
-                f"none of its {plural(self.rows, self.item)} is finite", path=path, hint=hint
-            )
+            hint = None
+            if not points:
+                hint = "use an earlier checkpoint of the training"
+            text = f"none of its {plural(self.rows, self.item)} is finite"
+            raise InputError(text, path=path, hint=hint)
         if self.noise == left:
             text = f"all of its {plural(self.noise, 'point')} are marked as noise or invalid, or at 0 0 0"
             raise InputError(text, path=path)
@@ -203,19 +231,29 @@ class Tally:
                 "point",
                 "dropped that the file marks as noise or invalid, or stores at 0 0 0",
             ),
-            "clamped_logits": (self.logits, "opacity logit", f"beyond ±{LOGIT_LIMIT:g} clamped"),
-            "clamped_scales": (self.scales, "log-scale", f"beyond ±{LOG_SCALE_LIMIT:g} clamped"),
-            "zero_quats": (self.quats, "quaternion", "of length zero made the identity"),
+            "clamped_logits": (
+                self.logits,
+                "opacity logit",
+                f"beyond ±{LOGIT_LIMIT:g} clamped",
+            ),
+            "clamped_scales": (
+                self.scales,
+                "log-scale",
+                f"beyond ±{LOG_SCALE_LIMIT:g} clamped",
+            ),
+            "zero_quats": (
+                self.quats,
+                "quaternion",
+                "of length zero made the identity",
+            ),
         }
-        notes = [
-            Note(code, count, f"{plural(count, what)} {then}")
-            for code, (count, what, then) in changes.items()
-            if count
-        ]
+        notes = []
+        for code, (count, what, then) in changes.items():
+            if count:
+                notes.append(Note(code, count, f"{plural(count, what)} {then}"))
         if self.brightest < DRAWN_LOGIT and not points:
-            notes.append(
-                Note("invisible", left, "the scene is invisible: every opacity is below 1/255")
-            )
+            text = "the scene is invisible: every opacity is below 1/255"
+            notes.append(Note("invisible", left, text))
         return notes
 
 

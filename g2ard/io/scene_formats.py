@@ -47,7 +47,12 @@ FORMATS: dict[FormatName, SceneFormat] = {
     "ply": SceneFormat(".ply", "ply", options=("normals", "layout")),
     "sog": SceneFormat(".sog", "sog_write", loss=1, tells=True),
     "spz": SceneFormat(
-        ".spz", "spz", options=("spz_version", "axes"), axes="RUB", loss=2, tells=True
+        ".spz",
+        "spz",
+        options=("spz_version", "axes"),
+        axes="RUB",
+        loss=2,
+        tells=True,
     ),
     "glb": SceneFormat(".glb", "glb", options=("compress",), models=False, axes="LUF"),
     "splat": SceneFormat(".splat", "splat", models=False, loss=2),
@@ -88,19 +93,28 @@ def scene_format(path: AnyPath) -> SceneFormat:
 
 def files_of(path: Path) -> list[Path]:
     """Return the files that writing a scene may create: the path, or a meta.json and its images."""
-    return [
-        path,
-        *(path.with_name(f"{name}.webp") for name in _FOLDER_IMAGES * (path.name == "meta.json")),
-    ]
+    files = [path]
+    if path.name == "meta.json":
+        files += [path.with_name(f"{name}.webp") for name in _FOLDER_IMAGES]
+    return files
 
 
-_FOLDER_IMAGES = ("means_l", "means_u", "scales", "quats", "sh0", "shN_centroids", "shN_labels")
+_FOLDER_IMAGES = (
+    "means_l",
+    "means_u",
+    "scales",
+    "quats",
+    "sh0",
+    "shN_centroids",
+    "shN_labels",
+)
 
 
 def written_bytes(path: Path) -> int:
     """Return the size of a written scene: of its file, or of all files beside a meta.json."""
-    files = path.parent.iterdir() if path.name == "meta.json" else [path]
-    return sum(file.stat().st_size for file in files)
+    if path.name == "meta.json":
+        return sum(file.stat().st_size for file in path.parent.iterdir())
+    return path.stat().st_size
 
 
 def lost_in(path: AnyPath, splats: Splats, **options: object) -> list[Note]:
@@ -112,13 +126,13 @@ def lost_in(path: AnyPath, splats: Splats, **options: object) -> list[Note]:
     is_spz = output_format.module == "spz" or options.get("compress") == "spz"
     # SPZ inside a .glb has a flag for it
     if splats.antialiased and not (output_format.models or is_spz):
-        suffix = output_format.suffix
-        text = (
-            f"{suffix} cannot say that the scene is antialiased; other programs draw it too opaque"
-        )
+        what = f"{output_format.suffix} cannot say that the scene is antialiased"
+        text = f"{what}; other programs draw it too opaque"
         notes.append(Note("lost_render_model", 1, text))
-    if output_format.module == "splat" and (place := _unstated(path, splats)):
-        notes.append(Note("lost_place", 1, place))
+    if output_format.module == "splat":
+        place = _unstated(path, splats)
+        if place:
+            notes.append(Note("lost_place", 1, place))
     if is_spz and len(splats) > LARGEST_SPZ:
         text = f"readers of SPZ from before May 2026 refuse more than {LARGEST_SPZ:,} Gaussians"
         notes.append(Note("large_spz", len(splats), text))
@@ -130,20 +144,25 @@ def _unstated(path: AnyPath, splats: Splats) -> str | None:
     from g2ard.io.splat import form_of
 
     form = form_of(splats)
-    if form.axes == "RDF" and not form.offset.any():
-        return None
+    options = ""
     if form.offset.any():
-        move = f" --translate={','.join(f'{v:.12g}' for v in form.offset)}"
-    else:
-        move = ""
-    turn = "" if form.axes == "RDF" else f" --to-axes {form.axes}"
+        shift = ",".join(f"{value:.12g}" for value in form.offset)
+        options += f" --translate={shift}"
+    if form.axes != "RDF":
+        options += f" --to-axes {form.axes}"
+    if not options:
+        return None
     return (
         "cannot state map coordinates: positions are relative to the scene's middle, y down; "
-        f"`g2ard convert {Path(path).name} OUT.ply{move}{turn}` puts them back"
+        f"`g2ard convert {Path(path).name} OUT.ply{options}` puts them back"
     )
 
 
-def check_positions(path: AnyPath, splats: Splats, count: int | None = None) -> None:
+def check_positions(
+    path: AnyPath,
+    splats: Splats,
+    count: int | None = None,
+) -> None:
     """Raise the `InputError` of writing a scene whose positions the format cannot hold, before the work.
 
     Gaussians of surfaces widen with the root of the ratio when the scene is reduced to `count`.
@@ -152,10 +171,11 @@ def check_positions(path: AnyPath, splats: Splats, count: int | None = None) -> 
     if hasattr(writer, "check_far") and len(splats):
         from g2ard.io.packing import as_packed
 
-        widened = (len(splats) / (count or len(splats))) ** 0.5
+        ratio = len(splats) / (count or len(splats))
         with naming(path):
             packed = as_packed(splats)
-            writer.check_far(packed, packed.means.astype(float), widened)
+            means = packed.means.astype(float)
+            writer.check_far(packed, means, widened=ratio**0.5)
 
 
 @dataclass
@@ -175,7 +195,10 @@ class Rounding:
         largest = splats.scales.max(axis=1)
         largest.partition(len(largest) // 2)
         typical = float(largest[len(largest) // 2])
-        self._told |= error > (0.0 if self.far else _VISIBLE_ROUNDING * typical)
+        if self.far:
+            self._told |= error > 0
+        else:
+            self._told |= error > _VISIBLE_ROUNDING * typical
         self._count += len(splats)
         self._worst = max(self._worst, (error, typical))
 
@@ -184,11 +207,11 @@ class Rounding:
         """A note on the largest change, if it is to be told."""
         from g2ard.io.types import Note
 
+        if not self._told:
+            return []
         error, typical = self._worst
         size = f"a typical Gaussian has a scale of {typical:.2g}"
         text = f"positions are rounded by up to {error:.2g} units; {size}"
-        if not self._told:
-            return []
         return [Note("rounded_positions", self._count, text)]
 
 
@@ -196,9 +219,9 @@ def axes_note(path: AnyPath, options: dict[str, Any]) -> str | None:
     """Return a note on the axes of a written file if programs differ in them; `options` are the writer's."""
     output_format = scene_format(path)
     axes = options.get("axes")
-    if "axes" not in output_format.options or (
-        axes is not None and options.get("spz_version", 3) == 4
-    ):
+    if "axes" not in output_format.options:
+        return None
+    if axes is not None and options.get("spz_version", 3) == 4:
         return None
     if axes == "RDF":
         return (

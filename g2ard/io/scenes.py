@@ -50,8 +50,9 @@ def read_back(path: str | Path, splats: Splats) -> Splats:
     """Read what was written of a scene, where the scene is even if the format cannot say so."""
     read = read_splats(path)
     writer = scene_format(path).writer()
-    back: Splats = writer.read_back(splats, read) if hasattr(writer, "read_back") else read
-    return back
+    if hasattr(writer, "read_back"):
+        read = writer.read_back(splats, read)
+    return read
 
 
 def check_scene_output(path: str | Path, overwrite: bool = False) -> Path:
@@ -102,9 +103,14 @@ def write_splats(
     """
     from g2ard.scene.splats import scene_of
 
-    tell(
-        path, write_scene(path, scene_of(splats), overwrite=overwrite, progress=progress, **options)
+    notes = write_scene(
+        path,
+        scene_of(splats),
+        overwrite=overwrite,
+        progress=progress,
+        **options,
     )
+    tell(path, notes)
 
 
 def write_scene(
@@ -122,10 +128,13 @@ def write_scene(
     output_format = check_options(path, options)
     check_scene_output(path, overwrite)
     writer = getattr(output_format.writer(), output_format.function)
-    told = {"progress": progress} if output_format.tells else {}
+    given: dict[str, Any] = {"overwrite": overwrite, **options}
+    if output_format.tells:
+        given["progress"] = progress
     with naming(path):
-        error = writer(Path(path), splats, overwrite=overwrite, **told, **options)
-    rounding = Rounding(far=bool((splats.narrowed().offset != splats.offset).any()))
+        error = writer(Path(path), splats, **given)
+    moved = splats.narrowed().offset != splats.offset
+    rounding = Rounding(far=bool(moved.any()))
     rounding.add(error, splats)
     return [*rounding.notes, *lost_in(path, splats, **options)]
 
@@ -153,7 +162,13 @@ def write_table(path: Path, splats: Splats, *, overwrite: bool = False) -> None:
             far = splats.offset.any()
             digits = ["%.17g" if far and name in ("x", "y", "z") else "%.9g" for name in table]
             rows = np.column_stack([values.astype(float) for values in table.values()])
-            np.savetxt(file, rows, fmt=digits, delimiter=",", newline="\r\n")
+            np.savetxt(
+                file,
+                rows,
+                fmt=digits,
+                delimiter=",",
+                newline="\r\n",
+            )
 
 
 def tell(path: str | Path, notes: Iterable[Note], say: Say | None = None) -> None:
@@ -200,7 +215,12 @@ def read_cloud(path: str | Path, *, bare: bool = False) -> Cloud:
     return Source(path).cloud(bare=bare).whole()
 
 
-def write_points(path: str | Path, points: Points, *, overwrite: bool = False) -> None:
+def write_points(
+    path: str | Path,
+    points: Points,
+    *,
+    overwrite: bool = False,
+) -> None:
     """Write a coloured point cloud as .ply (float64 positions, 8-bit colours) atomically."""
     import g2ard.io.cloud_ply as cloud_ply
 

@@ -33,14 +33,16 @@ from g2ard.io.types import Note
 from g2ard.progress import plural
 from g2ard.scene.transform import moved_axes, one_model
 
-_COEFFICIENTS = {0: 0, 1: 3, 2: 8, 3: 15}
+_COEFFICIENTS = (0, 3, 8, 15)  # past band 0, by SH degree
 _LARGEST_FLOAT32 = float.fromhex("0x1.fffffep+127")  # largest float32
 _LARGEST_LOG = math.log1p(_LARGEST_FLOAT32)
 _PALETTE_COLUMNS = 64  # entries of the SH palette per row of its image
 
 _Float32 = Annotated[float, msgspec.Meta(ge=-_LARGEST_FLOAT32, le=_LARGEST_FLOAT32)]
 _Log = Annotated[float, msgspec.Meta(ge=-_LARGEST_LOG, le=_LARGEST_LOG)]
-_Bound = _Float32 | Annotated[list[_Float32], msgspec.Meta(min_length=3, max_length=4)]
+_ChannelCount = msgspec.Meta(min_length=3, max_length=4)
+_Bound = _Float32 | Annotated[list[_Float32], _ChannelCount]
+_LogBound = _Log | Annotated[list[_Log], _ChannelCount]
 """A bound of all channels, or one of each: three, and opacity as the fourth."""
 
 _OneFile = Annotated[list[FileName], msgspec.Meta(min_length=1)]
@@ -49,8 +51,8 @@ _TwoFiles = Annotated[list[FileName], msgspec.Meta(min_length=2)]
 
 class _Means(msgspec.Struct):
     files: _TwoFiles
-    mins: _Log | Annotated[list[_Log], msgspec.Meta(min_length=3, max_length=4)]
-    maxs: _Log | Annotated[list[_Log], msgspec.Meta(min_length=3, max_length=4)]
+    mins: _LogBound
+    maxs: _LogBound
     shape: list[Whole] = []
 
 
@@ -135,7 +137,8 @@ class _Chunk:
             WebPImagePlugin,  # noqa: F401  (Pillow would load all its formats to find this one)
         )
 
-        with open_image(self.place / name, io.BytesIO(self.read(name))) as image:
+        content = io.BytesIO(self.read(name))
+        with open_image(self.place / name, content) as image:
             yield image
 
     def image(self, name: str) -> Bytes:
@@ -146,31 +149,28 @@ class _Chunk:
     def rows(self, name: str, count: int) -> Bytes:
         """Return (count, 4) bytes, one pixel per Gaussian."""
         pixels = self.image(name).reshape(-1, 4)
-        if len(pixels) < count:
-            raise InputError(
-                f"has {len(pixels):,} pixels for {count:,} Gaussians", path=self.place / name
-            )
+        self._check_pixels(name, len(pixels), count)
         return pixels[:count]
+
+    def _check_pixels(self, name: str, pixels: int, count: int) -> None:
+        if pixels < count:
+            text = f"has {pixels:,} pixels for {count:,} Gaussians"
+            raise InputError(text, path=self.place / name)
 
     def count(self) -> int:
         meta = self.meta
         if meta.version == 2:
             count = meta.count
+            place = self.file.to("count")
         else:
             count = next(iter(meta.means.shape), None)
+            place = self.file.to("means", "shape", 0)
         if count is None:
-            if meta.version == 2:
-                place = self.file.to("count")
-            else:
-                place = self.file.to("means", "shape", 0)
             raise place.error("is missing")
         first = meta.means.files[0]
         with self.open_image(first) as image:  # before allocating memory
             pixels = image.width * image.height
-        if pixels < count:
-            raise InputError(
-                f"has {pixels:,} pixels for {count:,} Gaussians", path=self.place / first
-            )
+        self._check_pixels(first, pixels, count)
         return count
 
     def rest(self) -> int:
@@ -182,7 +182,7 @@ class _Chunk:
             return _COEFFICIENTS[part.bands]
         file = _sh_files(part)[0]
         rest, left = divmod(self.image(file).shape[1], _PALETTE_COLUMNS)
-        if left or rest not in _COEFFICIENTS.values():
+        if left or rest not in _COEFFICIENTS:
             text = "does not have the width of a palette of SH degree 1 to 3"
             raise InputError(text, path=self.place / file)
         return rest
@@ -190,16 +190,18 @@ class _Chunk:
     def means(self, count: int) -> Float32:
         """Decode only the (count, 3) means."""
         part = self.meta.means
-        low, high = (self.rows(name, count) for name in part.files[:2])
+        low = self.rows(part.files[0], count)
+        high = self.rows(part.files[1], count)
         means = np.empty((count, 3), np.float32)
         _fill_means(means, low, high, _positions(part))
         return means
 
 
 def _sh_files(part: _Rest) -> tuple[str, str]:
-    files = part.files[:2]
-    centroids = next((f for f in files if "centroids" in f), files[0])
-    return centroids, next((f for f in files if f != centroids), files[1])
+    first, second = part.files[:2]
+    if "centroids" in second and "centroids" not in first:
+        return second, first
+    return first, second
 
 
 class _Decoder:
@@ -253,7 +255,12 @@ class _Decoder:
         np.take(self._palette, index, axis=0, out=out[:, : self._rest], mode="clip")
 
 
-def _fill_means(out: Float32, low: Bytes, high: Bytes, positions: Values) -> None:
+def _fill_means(
+    out: Float32,
+    low: Bytes,
+    high: Bytes,
+    positions: Values,
+) -> None:
     """Decode positions from 16-bit codes, a byte from each of two images."""
     for axis in range(3):
         codes = _words(low[:, axis], high[:, axis])
@@ -267,8 +274,10 @@ def _words(low: Bytes, high: Bytes) -> Rows:
 
 def _positions(part: _Means) -> Values:
     """Return the (3, 65536) values of codes per axis, which are stored as sign(x)·ln(|x| + 1)."""
-    low, high = (np.atleast_1d(bound)[:3, None] for bound in (part.mins, part.maxs))
-    logs = low + (high - low) * (np.arange(65536) / 65535)
+    low = np.atleast_1d(part.mins)[:3, None]
+    high = np.atleast_1d(part.maxs)[:3, None]
+    shares = np.arange(65536) / 65535
+    logs = low + (high - low) * shares
     values = np.sign(logs) * np.expm1(np.abs(logs))
     return np.broadcast_to(values, (3, 65536)).astype(np.float32)
 
@@ -285,9 +294,14 @@ def _logits(place: Place, part: _Part) -> Values:
 def _ends(place: Place, part: _Part, channels: slice) -> Iterator[Values]:
     """Yield the lower and the upper bounds of channels."""
     for name, bound in (("mins", part.mins), ("maxs", part.maxs)):
-        if bound is None or (isinstance(bound, list) and len(bound) < channels.stop):
-            raise place.to(name, *([] if bound is None else [3])).error("is missing")
-        yield np.asarray(bound[channels] if isinstance(bound, list) else bound)
+        if bound is None:
+            raise place.to(name).error("is missing")
+        if isinstance(bound, list):
+            if len(bound) < channels.stop:
+                raise place.to(name, 3).error("is missing")
+            yield np.asarray(bound[channels])
+        else:
+            yield np.asarray(bound)
 
 
 def _values(place: Place, part: _Part) -> Callable[[Bytes], Values]:
@@ -322,15 +336,19 @@ def _quats(codes: Bytes) -> Values:
     return quats
 
 
-def _palette(chunk: _Chunk, part: _Rest, rest: int, count: int) -> tuple[Float32, Bytes]:
+def _palette(
+    chunk: _Chunk,
+    part: _Rest,
+    rest: int,
+    count: int,
+) -> tuple[Float32, Bytes]:
     """Return the (entries, K−1, 3) coefficients of the palette, and the labels."""
     centroids, labels = _sh_files(part)
     image = chunk.image(centroids)
-    if image.shape[1] != _PALETTE_COLUMNS * rest:
-        raise InputError(
-            f"has width {image.shape[1]}, expected {_PALETTE_COLUMNS * rest}",
-            path=chunk.place / centroids,
-        )
+    expected = _PALETTE_COLUMNS * rest
+    if image.shape[1] != expected:
+        text = f"has width {image.shape[1]}, expected {expected}"
+        raise InputError(text, path=chunk.place / centroids)
     values = _values(chunk.file.to("shN"), part)
     entries = image[:, :, :3].reshape(-1, rest, 3)
     return values(entries).astype(np.float32), chunk.rows(labels, count)
@@ -361,17 +379,23 @@ def chunks_of(path: Path) -> list[Path]:
         path = path.parent
     if (path / "meta.json").is_file():
         return [path]
-    if path.name == "lod-meta.json" or (path / "lod-meta.json").is_file():
-        return _listed(path if path.is_file() else path / "lod-meta.json")
+    index = path / "lod-meta.json"
+    if index.is_file():
+        return _listed(index)
+    if path.name == index.name:
+        return _listed(path)
     if not path.is_dir():
         return []
-    folders = sorted(p.parent for p in path.glob("*/meta.json"))
-    named = [(folder, match) for folder in folders if (match := _CHUNK_NAME.fullmatch(folder.name))]
-    if not named:
+    folders = sorted(file.parent for file in path.glob("*/meta.json"))
+    numbered = []
+    for folder in folders:
+        match = _CHUNK_NAME.fullmatch(folder.name)
+        if match:
+            numbered.append((int(match[1]), int(match[2]), folder))
+    if not numbered:
         return folders
-    numbered = sorted((int(match[1]), int(match[2]), folder) for folder, match in named)
-    finest = numbered[0][0]
-    return [folder for level, _, folder in numbered if level == finest]
+    finest, _, _ = min(numbered)
+    return [folder for level, _, folder in sorted(numbered) if level == finest]
 
 
 def _listed(index: Path) -> list[Path]:
@@ -384,7 +408,8 @@ def _listed(index: Path) -> list[Path]:
     nodes = [(content.tree, Place(index).to("tree"))]
     while nodes:
         node, place = nodes.pop()
-        nodes.extend((child, place.to("children", i)) for i, child in enumerate(node.children))
+        for i, child in enumerate(node.children):
+            nodes.append((child, place.to("children", i)))
         if "0" in node.lods:
             place = place.to("lods", "0")
             at = checked(node.lods["0"], _Lod, place).file
@@ -426,10 +451,10 @@ def _left_out(path: Path, read_count: int) -> list[Note]:
     if path.suffix.lower() == ".sog" or (folder / "meta.json").is_file():
         return []
     others = len(list(folder.glob("*/meta.json"))) - read_count
+    if others <= 0:
+        return []
     text = f"{plural(others, 'other SOG folder')} ignored (coarser levels of detail)"
-    if others > 0:
-        return [Note("ignored_chunks", others, text)]
-    return []
+    return [Note("ignored_chunks", others, text)]
 
 
 class Stream(RawStream):
@@ -444,7 +469,8 @@ class Stream(RawStream):
             self._counts = [chunk.count() for chunk in chunks]
             self._rest = max((chunk.rest() for chunk in chunks), default=0)
             own = _own(chunks)
-            model = one_model([chunk.meta.render_model for chunk in chunks] or ["classic"])
+            models = [chunk.meta.render_model for chunk in chunks]
+        model = one_model(models or ["classic"])
         notes = tuple(_left_out(path, len(chunks)))
         offset = moved_axes(own.offset, own.axes, "RDF")
         super().__init__(path, sum(self._counts), self._rest, offset, notes, model)
@@ -453,8 +479,13 @@ class Stream(RawStream):
     def identity(self) -> list[Any]:
         if self.path.suffix.lower() == ".sog":
             return file_identity([self.path])
-        places = (place.iterdir() if place.is_dir() else [place] for place in chunks_of(self.path))
-        return file_identity(sorted(file for files in places for file in files if file.is_file()))
+        files = list[Path]()
+        for place in chunks_of(self.path):
+            if place.is_dir():
+                files += place.iterdir()
+            else:
+                files.append(place)
+        return file_identity(sorted(filter(Path.is_file, files)))
 
     def parts(self, rows: int) -> list[tuple[int, int]]:
         return ranges(self._counts, rows)
@@ -462,8 +493,10 @@ class Stream(RawStream):
     def positions(self, rows: int, start: int = 0) -> Iterator[Float32]:
         with _opened(self.path) as chunks:
             for number, begin in from_row(self._counts, start):
-                means = self.in_axes(chunks[number].means(self._counts[number]))
-                yield from (means[at : at + rows] for at in range(begin, len(means), rows))
+                means = chunks[number].means(self._counts[number])
+                means = self.in_axes(means)
+                for at in range(begin, len(means), rows):
+                    yield means[at : at + rows]
 
     def raw(self, rows: int, start: int) -> Iterator[Raw]:
         with _opened(self.path) as chunks:
@@ -478,7 +511,10 @@ class Stream(RawStream):
 
 @contextmanager
 def _opened(path: Path) -> Iterator[list[_Chunk]]:
-    places = [path] if path.suffix.lower() == ".sog" else chunks_of(path)
+    if path.suffix.lower() == ".sog":
+        places = [path]
+    else:
+        places = chunks_of(path)
     with ExitStack() as opened:
         yield [opened.enter_context(_chunk(place)) for place in places]
 
@@ -494,10 +530,11 @@ def _chunk(path: Path) -> Iterator[_Chunk]:
             for info in bundle.infolist():  # as .NET writes them on Windows
                 info.filename = info.filename.replace("\\", "/")
                 bundle.NameToInfo[info.filename] = info
-            inside = [name for name in bundle.namelist() if name.rpartition("/")[2] == "meta.json"]
-            if not inside:
+            metas = [name for name in bundle.namelist() if name.rpartition("/")[2] == "meta.json"]
+            if not metas:
                 raise InputError("has no meta.json", path=path)
-            yield _Chunk(path, zipfile.Path(bundle, min(inside, key=len).removesuffix("meta.json")))
+            folder = min(metas, key=len).removesuffix("meta.json")
+            yield _Chunk(path, zipfile.Path(bundle, folder))
     except InputError:
         raise
     except (

@@ -44,7 +44,11 @@ _KMEANS_STEPS = 6  # steps of k-means after the split; 10 more gain 0.01 dB
 
 
 def write(
-    path: Path, splats: Splats, *, overwrite: bool = False, progress: Progress = silent
+    path: Path,
+    splats: Splats,
+    *,
+    overwrite: bool = False,
+    progress: Progress = silent,
 ) -> float:
     """Write a .sog: the files of `sog_files`, zipped without compression; equal scenes give equal bytes.
 
@@ -60,12 +64,17 @@ def sog_bytes(splats: Splats, progress: Progress = silent) -> bytes:
     room = io.BytesIO()
     with zipfile.ZipFile(room, "w") as bundle:
         for name, content in sog_files(splats, progress=progress).items():
-            bundle.writestr(zipfile.ZipInfo(name, (1980, 1, 1, 0, 0, 0)), content)
+            info = zipfile.ZipInfo(name)  # of 1980, so that equal scenes give equal bytes
+            bundle.writestr(info, content)
     return room.getvalue()
 
 
 def write_folder(
-    path: Path, splats: Splats, *, overwrite: bool = False, progress: Progress = silent
+    path: Path,
+    splats: Splats,
+    *,
+    overwrite: bool = False,
+    progress: Progress = silent,
 ) -> float:
     """Write `path`, a meta.json, and its images beside it; return what `write` returns."""
     with atomic_folder(path.parent, overwrite) as temporary:
@@ -79,7 +88,8 @@ def largest_rounding(splats: Splats) -> float:
     near = as_stored(splats)
     low, high, codes = _means(near)
     logs = low + codes / 65535 * (high - low)
-    packed = rounding(near, np.sign(logs) * np.expm1(np.abs(logs)) + near.offset)
+    stored = np.sign(logs) * np.expm1(np.abs(logs))
+    packed = rounding(near, stored + near.offset)
     return rounding(splats, splats.narrowed()) + packed
 
 
@@ -93,7 +103,10 @@ def palette_size(count: int) -> int:
 
 
 def sog_files(
-    splats: Splats, *, ordered: bool = False, progress: Progress = silent
+    splats: Splats,
+    *,
+    ordered: bool = False,
+    progress: Progress = silent,
 ) -> dict[str, bytes]:
     """Return the files of a scene by name, meta.json last; rows in `packing_order` unless already `ordered`.
 
@@ -105,8 +118,12 @@ def sog_files(
         splats = splats.take(packing_order(splats.means))
     width, height = _size(len(splats))
     files = {}
-    meta = {"version": 2, "asset": {"generator": f"g2ard {__version__}"}, "count": len(splats)}
-    meta["antialias"] = splats.antialiased
+    meta = {
+        "version": 2,
+        "asset": {"generator": f"g2ard {__version__}"},
+        "count": len(splats),
+        "antialias": splats.antialiased,
+    }
     if splats.antialiased:
         meta["model"] = "antialiased"  # newer spelling
 
@@ -123,30 +140,38 @@ def sog_files(
 
     low, high, codes = _means(splats)
     names = [image("means_l", codes & 255), image("means_u", codes >> 8)]
-    meta["means"] = {"mins": low.tolist(), "maxs": high.tolist(), "files": names}
+    meta["means"] = {
+        "mins": low.tolist(),
+        "maxs": high.tolist(),
+        "files": names,
+    }
     book, labels = _numbers(log_scales(splats))
-    meta["scales"] = {"codebook": book.tolist(), "files": [image("scales", labels)]}
+    meta["scales"] = {
+        "codebook": book.tolist(),
+        "files": [image("scales", labels)],
+    }
     largest, others = smallest_three(unit_quats(splats.quats))
     parts = coded(others / math.sqrt(2) + 0.5, 255)
     quats = np.column_stack([parts, 252 + largest])
     meta["quats"] = {"files": [image("quats", quats)]}
     book, labels = _numbers(splats.sh0[:, 0])
     sh0 = np.column_stack([labels, coded(splats.opacities, 255)])
-    meta["sh0"] = {"codebook": book.tolist(), "files": [image("sh0", sh0)]}
+    meta["sh0"] = {
+        "codebook": book.tolist(),
+        "files": [image("sh0", sh0)],
+    }
     if splats.sh_degree:
         count, book, centroids, entry = _rest(splats)
         files["shN_centroids.webp"] = _webp(centroids)
-        names = [
-            "shN_centroids.webp",
-            image("shN_labels", np.column_stack([entry & 255, entry >> 8])),
-        ]
+        labels = np.column_stack([entry & 255, entry >> 8])
         meta["shN"] = {
             "count": count,
             "bands": splats.sh_degree,
             "codebook": book.tolist(),
-            "files": names,
+            "files": ["shN_centroids.webp", image("shN_labels", labels)],
         }
-    if own := own_place(splats):
+    own = own_place(splats)
+    if own:
         meta["g2ard"] = own
     files["meta.json"] = json.dumps(meta, separators=(",", ":")).encode()
     return files
@@ -168,8 +193,14 @@ def _webp(pixels: Bytes) -> bytes:
     )
 
     buffer = io.BytesIO()
-    # exact keeps the colours of pixels with A = 0, which are codes
-    Image.fromarray(pixels).save(buffer, "WEBP", lossless=True, exact=True, quality=50, method=2)
+    Image.fromarray(pixels).save(
+        buffer,
+        "WEBP",
+        lossless=True,
+        exact=True,  # keeps the colours of pixels with A = 0, which are codes
+        quality=50,
+        method=2,
+    )
     return buffer.getvalue()
 
 
@@ -193,7 +224,8 @@ def _numbers(values: Values) -> tuple[Float32, Rows]:
 def nearest(book: Float32, values: Float32) -> Rows:
     """Return the entry of an ascending codebook nearest to each value."""
     wide = book.astype(float)
-    return np.searchsorted((wide[1:] + wide[:-1]) / 2, values)
+    middles = (wide[1:] + wide[:-1]) / 2
+    return np.searchsorted(middles, values)
 
 
 def _weights(splats: Splats) -> Float32:
@@ -201,8 +233,8 @@ def _weights(splats: Splats) -> Float32:
 
     The root gains 0.35 dB over equal weights on a scene at 10×; α·A itself gains nothing.
     """
-    longer = longer_axes(splats.scales.astype(float)).prod(axis=1)
-    shown = np.sqrt(splats.opacities * np.minimum(longer, 1e30))
+    areas = longer_axes(splats.scales.astype(float)).prod(axis=1)
+    shown = np.sqrt(splats.opacities * np.minimum(areas, 1e30))
     mean = shown.mean()
     if not mean > 0:
         return np.ones(len(splats), np.float32)
@@ -214,11 +246,16 @@ def _rest(splats: Splats) -> tuple[int, Float32, Bytes, Values]:
     rest = splats.shN.shape[1]
     points = np.ascontiguousarray(splats.shN.reshape(len(splats), 3 * rest))
     entries, labels = _core.palette(
-        points, palette_size(len(splats)), _KMEANS_STEPS, _weights(splats)
+        points,
+        palette_size(len(splats)),
+        _KMEANS_STEPS,
+        _weights(splats),
     )
-    used = np.bincount(labels, minlength=len(entries)).astype(np.float32)
+    count = len(entries)
+    used = np.bincount(labels, minlength=count).astype(np.float32)
     book = _core.codebook(entries.ravel(), 256, np.repeat(used, 3 * rest))
-    rows = math.ceil(len(entries) / _PALETTE_COLUMNS)
+    rows = math.ceil(count / _PALETTE_COLUMNS)
     image = np.zeros((rows * _PALETTE_COLUMNS, rest, 3), np.uint8)
-    image[: len(entries)] = nearest(book, entries).reshape(-1, rest, 3)
-    return len(entries), book, image.reshape(rows, _PALETTE_COLUMNS * rest, 3), labels
+    image[:count] = nearest(book, entries).reshape(-1, rest, 3)
+    image = image.reshape(rows, _PALETTE_COLUMNS * rest, 3)
+    return count, book, image, labels

@@ -67,19 +67,21 @@ class Source:
         Memory holds one block of a .ply, .compressed.ply or .splat, one chunk of a SOG, one tile, or the
         whole file of other formats.
         """
-        stream: SceneStream = self._joined("splats") if self.others else self._opened("splats")
-        stream.render_model = self.render_model or stream.render_model
+        stream: SceneStream = self._open("splats")
+        if self.render_model:
+            stream.render_model = self.render_model
         return stream
 
     @cached_property
     def store(self) -> TileStore | None:
         """The scene's tiles, if it is a folder of tiles."""
-        tiled = self.format == "tiles" and not self.others
-        return self.scene.store if tiled else None  # type: ignore[attr-defined]
+        if self.format != "tiles" or self.others:
+            return None
+        return self.scene.store  # type: ignore[attr-defined]
 
     @cached_property
     def _points(self) -> PointStream:
-        stream: PointStream = self._joined("points") if self.others else self._opened("points")
+        stream: PointStream = self._open("points")
         if not self.through:
             return stream
         return self.through(stream)
@@ -98,17 +100,18 @@ class Source:
     @property
     def count(self) -> int:
         """Rows of the scene or point cloud."""
-        return (self.scene if self.kind == "splats" else self._points).count
+        if self.kind == "splats":
+            return self.scene.count
+        return self._points.count
 
     @property
     def map_system(self) -> str | None:
         """Map system that the file states, if it is a point cloud or tiles."""
         if self.kind == "points":
             return self._points.system
-        store = self.store if self.kind == "splats" else None
-        if store is None:
-            return None
-        return store.system
+        if self.kind == "splats" and self.store is not None:
+            return self.store.system
+        return None
 
     @property
     def metres_per_unit(self) -> float | None:
@@ -137,18 +140,16 @@ class Source:
         """Raise an `InputError` for anything but a scene."""
         reader(self.file, self.format, "splats")
 
-    def _joined(self, expected: Kind) -> Any:
-        """Open this one and the others as one stream."""
-        reader(self.file, self.format, expected)
-        first = Source(self.path, self.render_model)
-        first.__dict__["format"] = self.format  # it is detected once
-        return joined([first, *self.others])
-
     @explained
-    def _opened(self, expected: Kind) -> Any:
+    def _open(self, expected: Kind) -> Any:
+        """Open this one, or it and the others as one stream."""
         from g2ard.io.stream import PartsStream
 
         module = reader(self.file, self.format, expected)
+        if self.others:
+            first = Source(self.path, self.render_model)
+            first.__dict__["format"] = self.format  # it is detected once
+            return joined([first, *self.others])
         with about(self.file):
             if hasattr(module, "Stream"):
                 return module.Stream(self.file)

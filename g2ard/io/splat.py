@@ -15,7 +15,14 @@ from g2ard.io.stream import RawStream
 from g2ard.scene.splats import Splats, unit_quats
 from g2ard.scene.transform import restored
 
-_ROW = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
+_ROW = np.dtype(
+    [
+        ("mean", "<f4", 3),
+        ("scale", "<f4", 3),
+        ("rgba", "u1", 4),
+        ("quat", "u1", 4),
+    ]
+)
 
 
 _FAR = 1e18  # largest possible scale
@@ -37,17 +44,22 @@ class Stream(RawStream):
         with np.errstate(invalid="ignore"):
             possible = (scales >= 0) & (scales < _FAR)
         right = np.isfinite(rows["mean"]).all(1) & possible.all(1)
-        right &= rows.view("u1").reshape(len(rows), -1).any(1)
+        content = rows.view("u1").reshape(len(rows), -1)
+        right &= content.any(1)
         start = np.frombuffer(rows[:_READ].tobytes(), "u1")
-        words = bool(np.isin(start, _TEXT).all())
-        if words or right.mean() < _POSSIBLE:
-            what = "text" if words else f"{1 - right.mean():.0%} of its rows are impossible"
+        what = None
+        if np.isin(start, _TEXT).all():
+            what = "text"
+        elif right.mean() < _POSSIBLE:
+            what = f"{1 - right.mean():.0%} of its rows are impossible"
+        if what:
             hint = "rename it to the suffix of its format, or export it again"
             raise InputError(f"is not a .splat: {what}", hint=hint)
         super().__init__(path, size // _ROW.itemsize)
 
     def raw(self, rows: int, start: int) -> Iterator[Raw]:
-        for _, block in row_blocks(self.path, np.memmap(self.path, _ROW, "r"), rows, start):
+        every = np.memmap(self.path, _ROW, "r")
+        for _, block in row_blocks(self.path, every, rows, start):
             raw = Raw.empty(len(block), 0)
             raw.means[:] = block["mean"]
             raw.set_linear(block["scale"], block["rgba"])
@@ -81,7 +93,8 @@ def write(path: Path, splats: Splats, *, overwrite: bool = False) -> float:
     again = restored(form, form.axes)
     error = float(np.abs(again.positions - splats.positions).max())
     weight = form.scales.astype(float).prod(1) * form.opacities
-    splats = form.take(np.argsort(-weight, kind="stable"))
+    order = np.argsort(-weight, kind="stable")
+    splats = form.take(order)
     rows = np.empty(len(splats), _ROW)
     rows["mean"] = splats.means
     rows["scale"] = splats.scales

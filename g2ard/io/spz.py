@@ -19,7 +19,7 @@ import numpy as np
 
 import g2ard.io.packing as packing
 from g2ard.arrays import Bytes, Float, Values
-from g2ard.config.choices import Axes
+from g2ard.config.choices import Axes, RenderModel
 from g2ard.errors import InputError, damaged, missing, require
 from g2ard.io.atomic import atomic_output
 from g2ard.io.jsonfile import Place as JsonPlace
@@ -46,8 +46,22 @@ _COMMENTED = b"\x10"  # flag of a gzip header with a comment
 _HEADER_4 = 32  # size of the header of version 4, bytes
 
 _ADOBE_AXES: tuple[Axes, ...] = (
-    *("LDB", "RDB", "LUB", "RUB", "LDF", "RDF", "LUF", "RUF"),
-    *("LBU", "RBU", "LFU", "RFU", "LBD", "RBD", "LFD", "RFD"),
+    "LDB",
+    "RDB",
+    "LUB",
+    "RUB",
+    "LDF",
+    "RDF",
+    "LUF",
+    "RUF",
+    "LBU",
+    "RBU",
+    "LFU",
+    "RFU",
+    "LBD",
+    "RBD",
+    "LFD",
+    "RFD",
 )
 """Axes of the extension SPZ_ADOBE_coordinate_system, from number 1 on, as @adobe/spz 0.2.3 stores and reads
 them. Its header swaps the names of 9 and 15, and of 10 and 16.
@@ -72,7 +86,9 @@ def names_axes(path: Path) -> bool:
     data = path.read_bytes()
     if b'"stored"' in _comment(data):
         return True
-    if len(data) < _HEADER_4 or data[:5] != _MAGIC + b"\4" or not data[14] & _HAS_EXTENSIONS:
+    if len(data) < _HEADER_4 or data[:5] != _MAGIC + b"\4":
+        return False
+    if not data[14] & _HAS_EXTENSIONS:
         return False
     with about(path):
         return _extensions(data)[0] != "RUB"
@@ -85,21 +101,26 @@ def decoded(path: Path, data: bytes) -> Noted:
         data = _gunzip(data)
     sizes = _sizes(data)
     version, count, degree, fraction_bits, flags, stream_count = struct.unpack_from(
-        "<IIBBBB", data, 4
+        "<IIBBBB",
+        data,
+        4,
     )
     stored = _COEFFICIENTS[degree]
     if version == 4:
         streams = _zstd_streams(data, stream_count, sizes)
     else:
         streams = _slices(data, sizes)
-    positions, alphas, colors, scales, rotations, sh = (np.frombuffer(s, np.uint8) for s in streams)
-
+    arrays = [np.frombuffer(stream, np.uint8) for stream in streams]
+    positions, alphas, colors, scales, rotations, sh = arrays
     kept = min(stored, 15)
     raw = Raw.empty(count, kept)
     steps = _fixed24(positions.reshape(-1, 3)).reshape(-1, 3)
     raw.means[:] = steps / (1 << fraction_bits) * (1, -1, -1)
     raw.log_scales[:] = scales.reshape(-1, 3) / 16 - 10
-    quats = _quats_xyz(rotations) if version == 2 else _quats_packed(rotations)
+    if version == 2:
+        quats = _quats_xyz(rotations)
+    else:
+        quats = _quats_packed(rotations)
     raw.quats[:] = quats * (1, 1, -1, -1)
     raw.logit_opacities[:] = logits_of(alphas / 255)
     shades = colors.reshape(-1, 3) / 255
@@ -111,14 +132,19 @@ def decoded(path: Path, data: bytes) -> Noted:
         notes.append(Note("ignored_bands", 1, "spherical harmonics past degree 3 ignored"))
     axes: Axes = "RUB"
     if flags & _HAS_EXTENSIONS:
-        axes, own, ignored = _extensions(data) if version == 4 else (axes, own, 1)
+        ignored = 1
+        if version == 4:
+            axes, own, ignored = _extensions(data)
         if ignored:
             notes.append(Note("ignored_extensions", ignored, "SPZ extensions ignored"))
-    scene, told = cleaned(raw, notes, "antialiased" if flags & _ANTIALIASED else "classic")
+    model: RenderModel = "classic"
+    if flags & _ANTIALIASED:
+        model = "antialiased"
+    scene, all_notes = cleaned(raw, notes, model)
     if axes != "RUB":
-        matrix = change_of_axes(axes, "RDF") @ change_of_axes("RDF", "RUB")  # so far taken for RUB
-        scene = with_axes(scene, matrix)
-    return _in_place(path, scene, own), told
+        from_rub = change_of_axes("RDF", "RUB")  # so far taken for RUB
+        scene = with_axes(scene, change_of_axes(axes, "RDF") @ from_rub)
+    return _in_place(path, scene, own), all_notes
 
 
 class _Own(msgspec.Struct):
@@ -137,10 +163,12 @@ def _in_place(path: Path, scene: Splats, own: bytes) -> Splats:
     """Return a scene with the offset and axes that g2ard stated in a comment or record, if it is one."""
     if b'"g2ard"' not in own:
         return scene
-    place = checked(parse_json(own.decode("latin-1")), _Comment, JsonPlace(path)).g2ard
+    content = parse_json(own.decode("latin-1"))
+    place = checked(content, _Comment, JsonPlace(path)).g2ard
     if place.stored != "RUB":
         scene = with_axes(scene, change_of_axes(place.stored, "RUB"))
-    return restored(replace(scene, offset=moved_axes(place.offset, place.axes, "RDF")), place.axes)
+    offset = moved_axes(place.offset, place.axes, "RDF")
+    return restored(replace(scene, offset=offset), place.axes)
 
 
 def _comment(data: bytes) -> bytes:
@@ -157,21 +185,23 @@ def _extensions(data: bytes) -> tuple[Axes, bytes, int]:
     others = 0
     at = _HEADER_4
     (end,) = struct.unpack_from("<I", data, 16)
-    while at + 8 <= min(end, len(data)):
+    end = min(end, len(data))
+    while at + 8 <= end:
         kind, size = struct.unpack_from("<II", data, at)
-        if at + 8 + size > min(end, len(data)):
+        begin = at + 8
+        at = begin + size
+        if at > end:
             raise damaged("truncated: an extension is cut off")
         if kind == _COORDINATE_SYSTEM and size == 4:
-            (number,) = struct.unpack_from("<I", data, at + 8)
+            (number,) = struct.unpack_from("<I", data, begin)
             if number > len(_ADOBE_AXES):
                 raise InputError(f"unknown coordinate system {number}; expected 0 to 16")
             if number:
                 axes = _ADOBE_AXES[number - 1]
         elif kind == _OWN_PLACE:
-            own = data[at + 8 : at + 8 + size]
+            own = data[begin:at]
         else:
             others += 1
-        at += 8 + size
     return axes, own, others
 
 
@@ -182,7 +212,9 @@ def _gunzip(data: bytes) -> bytes:
         head = stream.decompress(data, _HEADER)
         promised = sum(_sizes(head))
         check_unpacked(len(data), promised)
-        body = stream.decompress(stream.unconsumed_tail, promised) if promised else b""
+        body = b""
+        if promised:
+            body = stream.decompress(stream.unconsumed_tail, promised)
     except zlib.error as error:
         raise damaged(f"truncated or broken gzip stream ({error})") from error
     return head + body
@@ -200,9 +232,8 @@ def _sizes(head: bytes) -> list[int]:
     if degree >= len(_COEFFICIENTS):
         raise InputError(f"unsupported SH degree {degree}; expected 0 to 4")
     if fraction_bits > _POSITION_BITS:
-        raise InputError(
-            f"is {fraction_bits}, expected at most {_POSITION_BITS}", property="fractionalBits"
-        )
+        text = f"is {fraction_bits}, expected at most {_POSITION_BITS}"
+        raise InputError(text, property="fractionalBits")
     rotation = 3 if version == 2 else 4
     return [count * size for size in (9, 1, 3, 3, rotation, 3 * _COEFFICIENTS[degree])]
 
@@ -225,13 +256,13 @@ def _zstd_streams(data: bytes, stream_count: int, sizes: list[int]) -> list[byte
     streams = []
     start = table + 16 * stream_count
     entries += [(0, 0)] * len(sizes)
-    for i, (size, (packed, unpacked)) in enumerate(zip(sizes, entries, strict=False)):
+    for i, size in enumerate(sizes):
+        packed, unpacked = entries[i]
         if start + packed > len(data):
             raise damaged(f"truncated in stream {i}")
+        stream = b""
         if size == unpacked > 0:
             stream = _unpacked(data[start : start + packed], size)
-        else:
-            stream = b""
         if unpacked != size or len(stream) != size:
             raise damaged(f"stream {i} does not hold {size:,} bytes")
         streams.append(stream)
@@ -280,7 +311,9 @@ def _quats_packed(codes: Bytes) -> Float:
     parts = packed[:, None] >> np.array([20, 10, 0], np.uint32)
     magnitudes = (parts & np.uint32(511)) / (511 * np.sqrt(2))
     others = np.where(parts & np.uint32(512), -magnitudes, magnitudes)
-    return packing.from_smallest_three(packed >> np.uint32(30), others)[:, [3, 0, 1, 2]]
+    largest = packed >> np.uint32(30)
+    quats = packing.from_smallest_three(largest, others)
+    return quats[:, [3, 0, 1, 2]]
 
 
 def write(
@@ -306,16 +339,21 @@ def write(
             f"version {spz_version} has RUB axes, or RDF for programs that expect those of a .ply",
             hint="{spz_version=4} can name others",
         )
-    error = packing.rounding(splats, splats.narrowed()) if len(splats) else 0.0
+    error = 0.0
+    if len(splats):
+        error = packing.rounding(splats, splats.narrowed())
     splats = packing.as_packed(splats)
     own = packing.own_place(splats)
     bits = fraction_bits(splats.means.astype(float), splats)
     splats = replace(splats, offset=np.zeros(3))
     if axes != "RUB":
-        splats = with_axes(splats, change_of_axes("RUB", "RDF") @ change_of_axes("RDF", axes))
+        turn = change_of_axes("RUB", "RDF") @ change_of_axes("RDF", axes)
+        splats = with_axes(splats, turn)
     splats = splats.take(packing.packing_order(splats.means))
     means = splats.means.astype(float)
-    named: Axes = axes if spz_version == 4 else "RUB"
+    named: Axes = "RUB"
+    if spz_version == 4:
+        named = axes
     if own and axes != named:
         own["stored"] = axes
     comment = b""
@@ -352,12 +390,20 @@ def encoded(
     records = b""
     if axes != "RUB":
         flags |= _HAS_EXTENSIONS
-        records = struct.pack("<III", _COORDINATE_SYSTEM, 4, _ADOBE_AXES.index(axes) + 1)
+        number = _ADOBE_AXES.index(axes) + 1
+        records = struct.pack("<III", _COORDINATE_SYSTEM, 4, number)
     if comment and spz_version == 4:
         comment += b" " * (-len(comment) % 4)
         flags |= _HAS_EXTENSIONS
         records += struct.pack("<II", _OWN_PLACE, len(comment)) + comment
-    head = _MAGIC + struct.pack("<IIBBB", spz_version, len(splats), splats.sh_degree, bits, flags)
+    head = _MAGIC + struct.pack(
+        "<IIBBB",
+        spz_version,
+        len(splats),
+        splats.sh_degree,
+        bits,
+        flags,
+    )
     if spz_version < 4:
         return _gzipped(head + b"\0" + b"".join(streams), progress, comment)
     zstd = _zstandard()
@@ -381,17 +427,23 @@ def _gzipped(content: bytes, progress: Progress, comment: bytes) -> bytes:
         progress("pack", start, len(content))
         parts.append(packer.compress(content[start : start + _GZIP_BLOCK]))
     progress("pack", len(content), len(content))
-    packed = b"".join([*parts, packer.flush()])
+    parts.append(packer.flush())
+    packed = b"".join(parts)
     if not comment:
         return packed
     head = packed[:3] + _COMMENTED + packed[4:10]
     return head + comment + b"\0" + packed[10:]
 
 
-def check_far(splats: Splats, means: Float, widened: float = 1.0, movable: bool = False) -> None:
+def check_far(
+    splats: Splats,
+    means: Float,
+    widened: float = 1.0,
+    movable: bool = False,
+) -> None:
     """Raise the error of `fraction_bits` for a scene whose Gaussians will be `widened` times as large."""
-    wide = replace(splats, scales=splats.scales * np.float32(widened))
-    fraction_bits(means, wide, movable=movable)
+    scales = splats.scales * np.float32(widened)
+    fraction_bits(means, replace(splats, scales=scales), movable=movable)
 
 
 def fraction_bits(means: Float, splats: Splats, *, movable: bool = False) -> int:
@@ -416,39 +468,47 @@ def fraction_bits(means: Float, splats: Splats, *, movable: bool = False) -> int
     coarsest = max(float(np.median(middle)), 2.0**-_USUAL_BITS)
     if bits >= 0 and 2.0**-bits <= coarsest:
         return bits
+    away = reach
     if movable:
         away = np.abs(means - np.median(means, axis=0)).max(axis=1)
-    else:
-        away = reach
     least_bits = max(0, math.ceil(-math.log2(coarsest)))
     far = np.flatnonzero(away * margin > 2.0 ** (23 - least_bits))
     steps = f"(steps of {2.0**-bits:g})"
+    text = f".spz is too coarse at {farthest:g} from the origin {steps}"
     if 2 * len(far) > len(means):
-        raise InputError(
-            f".spz is too coarse at {farthest:g} from the origin {steps}",
-            hint="write another format",
-        )
+        raise InputError(text, hint="write another format")
     near = np.delete(splats.means, far, axis=0).astype(float) + splats.offset
     ends = [*np.floor(near.min(axis=0)), *np.ceil(near.max(axis=0))]
+    box = ",".join(f"{end:.0f}" for end in ends)
+    gaussians = f"{plural(len(far), 'Gaussian')} of {len(means):,}"
+    rows = some(far.tolist())
     raise InputError(
-        f".spz is too coarse at {farthest:g} from the origin {steps}, where {plural(len(far), 'Gaussian')} "
-        f"of {len(means):,} lie (row {some(far.tolist())})",
-        hint=f"crop the scene with `g2ard convert --box={','.join(f'{v:.0f}' for v in ends)}`, or write "
-        "another format",
+        f"{text}, where {gaussians} lie (row {rows})",
+        hint=f"crop the scene with `g2ard convert --box={box}`, or write another format",
     )
 
 
-def _streams(splats: Splats, means: Float, bits: int, version: int) -> list[bytes]:
+def _streams(
+    splats: Splats,
+    means: Float,
+    bits: int,
+    version: int,
+) -> list[bytes]:
     steps = means * (1, -1, -1) * (1 << bits)
     fixed = np.rint(steps).astype("<i4")
     quats = packing.unit_quats(splats.quats) * (1, 1, -1, -1)
-    signs = np.where(quats[:, :1] < 0, -1, 1)  # w ≥ 0
+    if version == 2:
+        signs = np.where(quats[:, :1] < 0, -1, 1)  # w ≥ 0
+        rotations = _bytes(quats[:, 1:] * signs * 127.5 + 127.5)
+    else:
+        rotations = _packed(quats)
+    shades = splats.sh0[:, 0].astype(float) * _COLOR_SCALE + 0.5
     streams = [
         fixed.reshape(-1, 1).view(np.uint8)[:, :3].tobytes(),
         _bytes(splats.opacities.astype(float) * 255),
-        _bytes((splats.sh0[:, 0].astype(float) * _COLOR_SCALE + 0.5) * 255),
+        _bytes(shades * 255),
         _bytes((packing.log_scales(splats) + 10) * 16),
-        _bytes(quats[:, 1:] * signs * 127.5 + 127.5) if version == 2 else _packed(quats),
+        rotations,
     ]
     if splats.sh_degree:  # in all 8 bits: rounding to fewer is where other writers lose most
         flips = FLIPS[: splats.shN.shape[1], None]

@@ -40,7 +40,11 @@ _EXTENT_SIGMAS = 3.0  # extent of a Gaussian, as a multiple of its largest scale
 
 
 def write(
-    path: Path, splats: Splats, *, overwrite: bool = False, progress: Progress = silent
+    path: Path,
+    splats: Splats,
+    *,
+    overwrite: bool = False,
+    progress: Progress = silent,
 ) -> float:
     """Write a .usda, or a .usdc if usd-core is installed; equal scenes give equal text.
 
@@ -70,17 +74,16 @@ def _attributes(splats: Splats) -> dict[str, tuple[str, Float32]]:
     means = (splats.means * _USD_TURN).astype(np.float32)
     reach = _EXTENT_SIGMAS * splats.scales.max(axis=1, keepdims=True)
     extent = np.stack([(means - reach).min(axis=0), (means + reach).max(axis=0)])
+    quats = unit_quats(splats.quats) * _QUAT_TURN
     rest = splats.shN * FLIPS[: splats.shN.shape[1], None]
+    bands = np.concatenate([splats.sh0, rest], axis=1)
     return {
         "extent": ("float3[]", extent),
         "positions": ("point3f[]", means),
-        "orientations": ("quatf[]", (unit_quats(splats.quats) * _QUAT_TURN).astype(np.float32)),
+        "orientations": ("quatf[]", quats.astype(np.float32)),
         "scales": ("float3[]", splats.scales.astype(np.float32)),
         "opacities": ("float[]", splats.opacities[:, None]),
-        f"{_SH}Coefficients": (
-            "float3[]",
-            np.concatenate([splats.sh0, rest], axis=1).reshape(-1, 3),
-        ),
+        f"{_SH}Coefficients": ("float3[]", bands.reshape(-1, 3)),
     }
 
 
@@ -100,14 +103,14 @@ def _print(file: TextIO, splats: Splats, progress: Progress) -> None:
     total = sum(len(values) for _, values in arrays.values())
     for name, (kind, values) in arrays.items():
         row = ", ".join(["%.9g"] * values.shape[1])
-        row = row if values.shape[1] == 1 else f"({row})"
+        if values.shape[1] > 1:
+            row = f"({row})"
         file.write(f"    {kind} {name} = [")
         for start in range(0, len(values), _TEXT_ROWS):
             block = values[start : start + _TEXT_ROWS]
-            file.write(
-                (", " if start else "")
-                + ", ".join([row] * len(block)) % tuple(block.ravel().tolist())
-            )
+            if start:
+                file.write(", ")
+            file.write(", ".join([row] * len(block)) % tuple(block.ravel().tolist()))
             done += len(block)
             progress("pack", done, total)
         file.write("]\n")
@@ -120,7 +123,12 @@ def _print(file: TextIO, splats: Splats, progress: Progress) -> None:
     file.write("}\n")
 
 
-def _save(pxr: Any, path: Path, splats: Splats, progress: Progress) -> None:
+def _save(
+    pxr: Any,
+    path: Path,
+    splats: Splats,
+    progress: Progress,
+) -> None:
     stage = pxr.Usd.Stage.CreateNew(str(path))
     pxr.UsdGeom.SetStageUpAxis(stage, pxr.UsdGeom.Tokens.y)
     pxr.UsdGeom.SetStageMetersPerUnit(stage, 1)
@@ -136,10 +144,13 @@ def _save(pxr: Any, path: Path, splats: Splats, progress: Progress) -> None:
         progress("pack", done, len(attributes))
         if kind == "quatf[]":
             values = values[:, [1, 2, 3, 0]]  # usd-core's memory order
-        values = np.ascontiguousarray(values[:, 0] if kind == "float[]" else values)
-        prim.GetAttribute(name).Set(arrays.get(kind, pxr.Vt.Vec3fArray).FromNumpy(values))
+        elif kind == "float[]":
+            values = values[:, 0]
+        array = arrays.get(kind, pxr.Vt.Vec3fArray)
+        prim.GetAttribute(name).Set(array.FromNumpy(np.ascontiguousarray(values)))
     if splats.offset.any():
-        field.AddTranslateOp().Set(pxr.Gf.Vec3d(*(splats.offset * _USD_TURN).tolist()))
+        shift = (splats.offset * _USD_TURN).tolist()
+        field.AddTranslateOp().Set(pxr.Gf.Vec3d(*shift))
     if splats.axes != "RDF":
         stage.GetRootLayer().customLayerData = {_AXES: splats.axes}
     stage.GetRootLayer().Save()
@@ -155,18 +166,23 @@ def read(path: Path) -> Noted:
         stage = pxr.Usd.Stage.Open(str(path))
     except pxr.Tf.ErrorException as error:
         raise _not_a_stage(error) from error
-    held = list(stage.Traverse(pxr.Usd.TraverseInstanceProxies(pxr.Usd.PrimDefaultPredicate)))
+    which = pxr.Usd.TraverseInstanceProxies(pxr.Usd.PrimDefaultPredicate)
+    held = list(stage.Traverse(which))
     fields = [prim for prim in held if _is_field(prim)]
     shown = [prim for prim in fields if _visible(pxr, prim)]
-    hidden = len(fields) - len(shown)
-    ignored = Note("invisible_prims", hidden, f"{plural(hidden, 'invisible prim')} ignored")
     parts = ((_read_prim(pxr, prim), _to_ply(pxr, stage, prim)) for prim in shown)
-    found = placed(parts) if shown else None
+    found = placed(parts)
     if found is None:
         raise InputError(_nothing(path, held, len(fields)))
+    scene, notes = found
     axes = stage.GetRootLayer().customLayerData.get(_AXES)
-    scene = restored(found[0], axes) if axes in AXES else found[0]
-    return scene, (*found[1], ignored) if hidden else found[1]
+    if axes in AXES:
+        scene = restored(scene, axes)
+    hidden = len(fields) - len(shown)
+    if hidden:
+        text = f"{plural(hidden, 'invisible prim')} ignored"
+        notes = (*notes, Note("invisible_prims", hidden, text))
+    return scene, notes
 
 
 def _not_a_stage(error: Exception) -> InputError:
@@ -179,24 +195,26 @@ def _not_a_stage(error: Exception) -> InputError:
 
 
 def _is_field(prim: Any) -> bool:
-    of_kernel = prim.GetTypeName() == "ParticleField" and _KERNEL in prim.GetAppliedSchemas()
-    return bool(prim.GetTypeName() == _SCHEMA or of_kernel)
+    kind = prim.GetTypeName()
+    if kind == "ParticleField":
+        return _KERNEL in prim.GetAppliedSchemas()
+    return bool(kind == _SCHEMA)
 
 
 def _visible(pxr: Any, prim: Any) -> bool:
     time = pxr.Usd.TimeCode.EarliestTime()
-    return bool(pxr.UsdGeom.Imageable(prim).ComputeVisibility(time) != pxr.UsdGeom.Tokens.invisible)
+    visibility = pxr.UsdGeom.Imageable(prim).ComputeVisibility(time)
+    return bool(visibility != pxr.UsdGeom.Tokens.invisible)
 
 
 def _nothing(path: Path, held: list[Any], fields: int) -> str:
     """Return why a stage has no splats that can be read: what it holds instead."""
     if fields:
         return f"has {plural(fields, 'prim')} of type {_SCHEMA}, all invisible"
-    words = [
-        str(word).lower()
-        for prim in held
-        for word in (prim.GetTypeName(), *prim.GetPropertyNames(), *prim.GetAppliedSchemas())
-    ]
+    words = list[str]()
+    for prim in held:
+        names = (prim.GetTypeName(), *prim.GetPropertyNames(), *prim.GetAppliedSchemas())
+        words += [str(name).lower() for name in names]
     if path.suffix.lower() == ".usdz":
         with suppress(zipfile.BadZipFile), zipfile.ZipFile(path) as archive:
             words += [name.lower() for name in archive.namelist()]
@@ -205,15 +223,14 @@ def _nothing(path: Path, held: list[Any], fields: int) -> str:
     if any(word in each for each in words for word in ("surfel", "surflet")):
         return f"holds surfels (flat particles), which are not supported; export the scene as .ply or {_SCHEMA}"
     types = sorted({str(prim.GetTypeName()) for prim in held} - {"", "Xform", "Scope"})
+    text = f"has no prim of type {_SCHEMA}"
+    if types:
+        text += f", only {', '.join(types[:4])}"
     if "Mesh" in types:
-        todo = f": {MESH}"
+        text += f": {MESH}"
     elif "Points" in types:
-        todo = f": {SCAN}"
-    else:
-        todo = ""
-    return f"has no prim of type {_SCHEMA}" + (
-        f", only {', '.join(types[:4])}{todo}" if types else ""
-    )
+        text += f": {SCAN}"
+    return text
 
 
 def _read_prim(pxr: Any, prim: Any) -> Noted:
@@ -221,20 +238,23 @@ def _read_prim(pxr: Any, prim: Any) -> Noted:
     count = len(means)
     notes = []
     degree = _earliest(pxr, prim.GetAttribute(f"{_SH}Degree"))
-    coefficients = any(
-        _given(pxr, prim, f"{_SH}Coefficients{half}") is not None for half in ("", "h")
-    )
-    degree = int(degree) if degree is not None and coefficients else 0
+    stored = [_given(pxr, prim, f"{_SH}Coefficients{half}") for half in ("", "h")]
+    coefficients = any(values is not None for values in stored)
+    if degree is not None and coefficients:
+        degree = int(degree)
+    else:
+        degree = 0
     if not 0 <= degree <= 3:
         raise InputError(f"unsupported SH degree {degree}; expected 0 to 3")
     size = (degree + 1) ** 2
     raw = Raw.empty(count, size - 1)
     raw.means[:] = means * _USD_TURN
-    quats = _values(pxr, prim, "orientations", 4, count)[:, [3, 0, 1, 2]]
-    raw.quats[:] = quats * _QUAT_TURN
+    quats = _values(pxr, prim, "orientations", 4, count)
+    raw.quats[:] = quats[:, [3, 0, 1, 2]] * _QUAT_TURN
     alphas = _values(pxr, prim, "opacities", 1, count)[:, 0]
     if coefficients:
-        bands = _values(pxr, prim, f"{_SH}Coefficients", 3, count * size).reshape(count, size, 3)
+        values = _values(pxr, prim, f"{_SH}Coefficients", 3, count * size)
+        bands = values.reshape(count, size, 3)
         base = bands[:, 0]
         raw.shN[:] = bands[:, 1:] * FLIPS[: size - 1, None]
     else:
@@ -243,10 +263,10 @@ def _read_prim(pxr: Any, prim: Any) -> Noted:
             raise InputError(f"has {len(rgb):,} values, expected {count:,}", property=_COLOR)
         rgb = rgb / choose_white(rgb, (1.0, 255.0))
         base = np.broadcast_to((rgb - 0.5) / SH_C0, (count, 3))
-        notes.append(
-            Note("display_color", count, "colours are those of displayColor, taken as sRGB")
-        )
-    notes += fill_linear(raw, _values(pxr, prim, "scales", 3, count), alphas, base)
+        text = "colours are those of displayColor, taken as sRGB"
+        notes.append(Note("display_color", count, text))
+    scales = _values(pxr, prim, "scales", 3, count)
+    notes += fill_linear(raw, scales, alphas, base)
     if _color_space(pxr, prim).lower().startswith("lin"):
         notes.append(LINEAR_NOTE)
     return cleaned(raw, notes)
@@ -259,7 +279,8 @@ def _color_space(pxr: Any, prim: Any) -> str:
         if attribute and attribute.HasColorSpace():
             return str(attribute.GetColorSpace())
     while prim:
-        if name := _earliest(pxr, prim.GetAttribute("colorSpace:name")):
+        name = _earliest(pxr, prim.GetAttribute("colorSpace:name"))
+        if name:
             return str(name)
         prim = prim.GetParent()
     return ""
@@ -279,22 +300,29 @@ def _given(pxr: Any, prim: Any, name: str) -> Any:
     return None
 
 
-def _values(pxr: Any, prim: Any, name: str, width: int, count: int | None) -> Float32:
+def _values(
+    pxr: Any,
+    prim: Any,
+    name: str,
+    width: int,
+    count: int | None,
+) -> Float32:
     """Return the (count, width) values of an attribute in float, or in half with an h after its name."""
     for found in (name, f"{name}h"):
-        if (values := _given(pxr, prim, found)) is not None:
-            rows = np.asarray(values, np.float32).reshape(-1, width)
-            if count is not None and len(rows) != count:
-                raise InputError(f"has {len(rows):,} values, expected {count:,}", property=name)
-            return rows
+        values = _given(pxr, prim, found)
+        if values is None:
+            continue
+        rows = np.asarray(values, np.float32).reshape(-1, width)
+        if count is not None and len(rows) != count:
+            raise InputError(f"has {len(rows):,} values, expected {count:,}", property=name)
+        return rows
     raise InputError(f"attribute {name!r} of {prim.GetPath()} is missing or empty")
 
 
 def _to_ply(pxr: Any, stage: Any, prim: Any) -> Float:
     """Return the (4, 4) matrix from the prim's flipped axes to the axes of a .ply."""
-    world = np.array(
-        pxr.UsdGeom.XformCache(pxr.Usd.TimeCode.EarliestTime()).GetLocalToWorldTransform(prim)
-    ).T  # USD multiplies rows
+    cache = pxr.UsdGeom.XformCache(pxr.Usd.TimeCode.EarliestTime())
+    world = np.array(cache.GetLocalToWorldTransform(prim)).T  # USD multiplies rows
     flip = np.diag([*_USD_TURN, 1.0])
     upright = np.eye(4)
     if pxr.UsdGeom.GetStageUpAxis(stage) == pxr.UsdGeom.Tokens.z:
