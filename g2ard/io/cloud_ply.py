@@ -47,9 +47,9 @@ class Stream(PointStream):
         (self._vertices,) = read_element(path, header, "vertex")
         rows = spread_rows(self._vertices)
         kinds = {name: self._vertices.dtype[own] for name, own in self._named.items()}
-        packed_names = [name for name in _PACKED if name in kinds and kinds[name].itemsize == 4]
         choices = [names for names in COLOR_NAMES if kinds.keys() >= set(names)]
-        choices += [(name,) for name in (*packed_names, *_INTENSITIES) if name in kinds]
+        choices += [(name,) for name in _PACKED if name in kinds and kinds[name].itemsize == 4]
+        choices += [(name,) for name in _INTENSITIES if name in kinds]
 
         def sampled(names: Names) -> list[MarkedPoints]:
             self._names = names
@@ -62,13 +62,14 @@ class Stream(PointStream):
             scales = [(255.0,)]
         widest = max(scales, key=lambda scales: scales[-1], default=(1.0,))
         super().__init__(path, len(self._vertices), sample, widest)
-        if not choices:
-            found = f"(found {' '.join(header.properties('vertex'))})"
-            self.lack = (
-                "needs the vertex properties 'red', 'green', 'blue' of a coloured point cloud, or "
-            )
-            self.lack += f"intensities {found}; rename its colours if they have other names"
-        if not choices and is_mesh(header):
+        if choices:
+            return
+        found = " ".join(header.properties("vertex"))
+        self.lack = (
+            "needs the vertex properties 'red', 'green', 'blue' of a coloured point cloud, or "
+            f"intensities (found {found}); rename its colours if they have other names"
+        )
+        if is_mesh(header):
             self.lack = "is a mesh without colours at its vertices"
             self.todo = MESH
 
@@ -96,18 +97,26 @@ def _color(path: Path, values: Values, name: str) -> Float32:
     scales = full_scales(values.dtype)
     low = float(finite.min(initial=0))
     top = float(finite.max(initial=0))
-    least = -0.5 if values.dtype.kind == "f" else 0
+    least = 0.0
+    if values.dtype.kind == "f":
+        least = -0.5
     if low < least or top > scales[-1] * 1.001:
         beyond = low if low < 0 else top
         raise InputError(
-            f"has a value of {beyond:g}, expected [0, {scales[-1]:g}]", path=path, property=name
+            f"has a value of {beyond:g}, expected [0, {scales[-1]:g}]",
+            path=path,
+            property=name,
         )
     with np.errstate(invalid="ignore"):  # a signalling NaN
         return values.astype(np.float32)
 
 
 def write_blocks(
-    path: Path, count: int, blocks: Iterable[Points], *, overwrite: bool = False
+    path: Path,
+    count: int,
+    blocks: Iterable[Points],
+    *,
+    overwrite: bool = False,
 ) -> None:
     """Write a binary .ply of `count` points that arrive in blocks: float64 positions, 8-bit colours."""
     types = dict.fromkeys(_POSITION, "<f8") | dict.fromkeys(COLOR_NAMES[0], "u1")

@@ -28,7 +28,13 @@ _COLUMNS = {
 
 _SHADES = ("red", "green", "blue"), ("intensity",)  # columns that colour points, the best first
 
-_TRIPLES = {6: (3,), 7: (4, 3), 8: (5, 4, 3), 9: (6, 3), 10: (7, 6, 4, 3)}
+_TRIPLES = {
+    6: (3,),
+    7: (4, 3),
+    8: (5, 4, 3),
+    9: (6, 3),
+    10: (7, 6, 4, 3),
+}
 """Number of columns without a heading → where colours may begin, the likeliest first."""
 
 _ALIKE = 0.5  # least correlation of the channels of colours that tells them from other columns
@@ -49,25 +55,27 @@ class Stream(HeldPoints):
             raise InputError("has no points")
         if "rgb" in names and "red" not in names:
             packed = table[:, names.index("rgb")]
-            whole = (packed == np.rint(packed)).all()
-            colors = unpack_colors(packed.astype("<u4" if whole else "<f4"))
-            # before unread columns
-            names[table.shape[1] : table.shape[1]] = ["red", "green", "blue"]
+            kind = "<f4"
+            if (packed == np.rint(packed)).all():
+                kind = "<u4"
+            colors = unpack_colors(packed.astype(kind))
+            read = table.shape[1]
+            names[read:read] = ["red", "green", "blue"]  # before unread columns
             table = np.column_stack([table, *colors])
         column = {name: names.index(name) for name in _COLUMNS if name in names}
-        if missing := [name for name in "xyz" if name not in column]:
-            raise InputError(f"has no column {missing[0]!r} (found {' '.join(names)})")
-        shades: tuple[str, ...] = next(
-            (names for names in _SHADES if set(names) <= set(column)), ()
-        )
+        for axis in "xyz":
+            if axis not in column:
+                raise InputError(f"has no column {axis!r} (found {' '.join(names)})")
+        choices = (shades for shades in _SHADES if column.keys() >= set(shades))
+        shades: tuple[str, ...] = next(choices, ())
         positions = table[:, [column[axis] for axis in "xyz"]]
         values = table[:, [column[name] for name in shades]]
         columns = dict(zip(names, table.T, strict=False))
-        super().__init__(path, positions, values, full_scales(np.dtype(float)), columns)
+        scales = full_scales(np.dtype(float))
+        super().__init__(path, positions, values, scales, columns)
         if not shades:
-            self.lack = (
-                f"has no colours (found columns {' '.join(names)}); name them red, green and blue"
-            )
+            found = " ".join(names)
+            self.lack = f"has no colours (found columns {found}); name them red, green and blue"
 
 
 def check_points(path: Path) -> None:
@@ -112,14 +120,17 @@ def _text(text: str) -> tuple[list[str], Float]:
         known = [i for i, name in enumerate(names) if name in _COLUMNS]
     try:
         table = np.loadtxt(
-            io.StringIO(plain_numbers(rows)), comments=("#", "//", "%"), usecols=known, ndmin=2
+            io.StringIO(plain_numbers(rows)),
+            comments=("#", "//", "%"),
+            usecols=known,
+            ndmin=2,
         )
     except ValueError as error:
         text = str(error).partition(";")[0]
         raise InputError(f"is not a table of numbers: {text}") from error
     if known is not None:
         unread = [name for name in names if name not in _COLUMNS]
-        names = [*(names[i] for i in known), *unread]
+        names = [names[i] for i in known] + unread
     elif table.size:
         names = _unnamed(table)
     return names, table
@@ -130,13 +141,11 @@ def _names(heading: str) -> list[str]:
     mark = next((mark for mark in ";,\t" if mark in heading), None)
     plain = re.sub(r"\[.*?\]|\(.*?\)", "", heading.lower()).strip(" #/%")
     words = [word.strip(" #/%'").replace(" ", "_") for word in plain.split(mark)]
-    usual = {
-        word: key
-        for word in words
-        for key, spelled in _COLUMNS.items()
-        if re.fullmatch(spelled, word)
-    }
-    return [usual.get(word, word) for word in words]
+    for i, word in enumerate(words):
+        for name, spelled in _COLUMNS.items():
+            if re.fullmatch(spelled, word):
+                words[i] = name
+    return words
 
 
 def _unnamed(table: Float) -> list[str]:
@@ -157,14 +166,17 @@ def _unnamed(table: Float) -> list[str]:
         columns = slice(start, start + 3)
         values = table[:, columns]
         top = values.max(initial=0)
-        most = 65535 if all(whole[columns]) else 1
+        most = 1
+        if all(whole[columns]):
+            most = 65535
         if not (values.min(initial=0) >= 0 and top <= most):  # also NaN
             continue
         varying = bool(np.ptp(values, axis=0).all())
         found.append((not varying, top > 255, start))
         alike[start] = 0.0
         if varying:
-            alike[start] = float(np.abs(np.corrcoef(values.T)).min())
+            correlations = np.corrcoef(values.T)
+            alike[start] = float(np.abs(correlations).min())
     if found:
         # an intensity beside colours differs from them more than they do
         likest = max(alike.values())
@@ -186,21 +198,21 @@ def _pcd(path: Path) -> tuple[list[str], Float]:
         raise damaged("has no line DATA")
     how = found[1].decode().lower()
     body = data[found.end() :]
-    words = [line.split() for line in data[: found.start()].decode("latin-1").splitlines()]
+    lines = data[: found.start()].decode("latin-1").splitlines()
+    words = [line.split() for line in lines]
     head = {line[0]: line[1:] for line in words if line}
     try:
         fields = head["FIELDS"]
         count = int(head["POINTS"][0])
         counts = head.get("COUNT") or "1" * len(fields)
         shapes = zip(head["TYPE"], head["SIZE"], counts, strict=True)
-        rows = np.dtype(
-            [
-                (f"{i}", f"<{kind.lower()}{size}", (int(n),))
-                for i, (kind, size, n) in enumerate(shapes)
-            ]
-        )
+        types = []
+        for i, (kind, size, width) in enumerate(shapes):
+            types.append((f"{i}", f"<{kind.lower()}{size}", (int(width),)))
+        rows = np.dtype(types)
         if how == "ascii":
-            values = np.loadtxt(io.StringIO(plain_numbers(body.decode("latin-1"))), ndmin=2)
+            text = plain_numbers(body.decode("latin-1"))
+            values = np.loadtxt(io.StringIO(text), ndmin=2)
             table = np.zeros(len(values), rows)
             at = 0
             for name in rows.names or ():

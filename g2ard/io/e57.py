@@ -31,7 +31,14 @@ _INTENSITY = ("intensity",)
 _UNSEEN = {_COLORS: ("isColorInvalid",), _INTENSITY: ("isIntensityInvalid",)}
 _SAMPLE_ROWS = 100_000  # points of each scan that tell where it is and how it is coloured
 
-_PANORAMA_AXES = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+_PANORAMA_AXES = np.array(
+    [
+        [0.0, 0, 1, 0],
+        [-1, 0, 0, 0],
+        [0, -1, 0, 0],
+        [0, 0, 0, 1],
+    ]
+)
 """OpenCV's camera axes in those of a panorama, whose middle is along x, with z up."""
 
 _FULL_CIRCLE = 0.01  # largest relative difference of a panorama's aspect from 2:1
@@ -51,11 +58,7 @@ class Stream(JoinedClouds):
             counts = [header.point_count for header in headers]
             check_unpacked(path.stat().st_size, 24 * sum(counts))
             self._photos = sum(node.isDefined("pose") for node in _images(file))
-            scans = [
-                _Scan(path, header, number)
-                for number, header in enumerate(headers)
-                if counts[number]
-            ]
+            scans = [_Scan(path, headers[i], i) for i, count in enumerate(counts) if count]
         if not scans:
             raise InputError("has no points")
         super().__init__(scans)
@@ -66,27 +69,22 @@ class Stream(JoinedClouds):
     def header_notes(self) -> Notes:
         found: dict[str, list[Note]] = {}
         for number, scan in enumerate(self.streams):
-            part = f"scan {number}: " if len(self.streams) > 1 else ""
             for note in scan.header_notes():
-                found.setdefault(note.code, []).append(replace(note, text=f"{part}{note}"))
-        notes = [
-            replace(
-                same[0], count=sum(note.count for note in same), text=f"{same[0]}{_more(len(same))}"
-            )
-            for same in found.values()
-        ]
+                if len(self.streams) > 1:
+                    note = replace(note, text=f"scan {number}: {note}")
+                found.setdefault(note.code, []).append(note)
+        notes = []
+        for same in found.values():
+            count = sum(note.count for note in same)
+            text = str(same[0])
+            if len(same) > 1:
+                text += f"; similar in {plural(len(same) - 1, 'other scan')}"
+            notes.append(replace(same[0], count=count, text=text))
         if self._photos:
-            text = (
-                f"{plural(self._photos, 'photo')} with poses inside; --views {self.path} uses them"
-            )
+            photos = plural(self._photos, "photo")
+            text = f"{photos} with poses inside; --views {self.path} uses them"
             notes.append(Note("photos", self._photos, text))
         return tuple(notes)
-
-
-def _more(count: int) -> str:
-    if count > 1:
-        return f"; similar in {plural(count - 1, 'other scan')}"
-    return ""
 
 
 class _Scan(PointStream):
@@ -97,26 +95,28 @@ class _Scan(PointStream):
         self.count = header.point_count
         self._number = number
         self.fields = tuple(header.point_fields)
-        self._names = names = set(self.fields)
-        place = next(
-            (fields for fields in (_CARTESIAN, _SPHERICAL) if names.issuperset(fields)), None
-        )
-        if place is None:
+        self._names = set(self.fields)
+        places = list(filter(self._names.issuperset, (_CARTESIAN, _SPHERICAL)))
+        if not places:
             what = "has no positions (cartesianX, cartesianY, cartesianZ)"
             raise InputError(what, index=number, item="scan")
-        self._place = place
-        self._rotation = rotation_matrices(np.asarray(header.rotation, float)[None])[0]
+        self._place = places[0]
+        quats = np.array([header.rotation], float)
+        self._rotation = rotation_matrices(quats)[0]
         self._translation = np.asarray(header.translation, float)
-        choices = [fields for fields in (_COLORS, _INTENSITY) if names.issuperset(fields)]
+        choices = list(filter(self._names.issuperset, (_COLORS, _INTENSITY)))
         self._color, sample = telling(choices, self._sampled)
-        limits = _limits(header, "intensity") if self._color == _INTENSITY else None
+        limits = None
+        if self._color == _INTENSITY:
+            limits = _limits(header, "intensity")
         scales = full_scales(np.dtype(float))
         super().__init__(path, self.count, sample, scales, limits)
         self.axes = "RFU"
-        if self.channels == 3 and (stated := _limits(header, "colorRed")):
-            dark, full = self._range
-            white = next((scale for scale in scales if scale >= stated[1]), full)
-            self._range = dark, full if full == 255 or full > white else white
+        stated = _limits(header, "colorRed")
+        if self.channels == 3 and stated is not None:
+            white = next((scale for scale in scales if scale >= stated[1]), self._full)
+            if self._full != 255:
+                self._full = max(self._full, white)
 
     def __getstate__(self) -> dict[str, Any]:
         raise TypeError("a scan cannot be searched, so that other processes would read all of it")
@@ -149,38 +149,52 @@ class _Scan(PointStream):
             fields = {name: np.empty(rows) for name in names}
             buffers = libe57.VectorSourceDestBuffer()
             for name, values in fields.items():
-                buffers.append(
-                    libe57.SourceDestBuffer(file.image_file, name, values, rows, True, True)
+                buffer = libe57.SourceDestBuffer(
+                    file.image_file,
+                    name,
+                    values,
+                    rows,
+                    True,
+                    True,
                 )
+                buffers.append(buffer)
             reader = file.get_header(self._number)["points"].reader(buffers)
             at = 0
             while got := reader.read():
                 skipped = min(got, max(0, start - at))
                 at += got
-                if skipped < got:
-                    yield self._points({name: v[skipped:got] for name, v in fields.items()})
+                if skipped == got:
+                    continue
+                here = {name: values[skipped:got] for name, values in fields.items()}
+                yield self._points(here)
             reader.close()
         if at < self.count:
             text = f"scan {self._number} has {at:,} of {self.count:,} points"
             raise InputError(text, path=self.path)
 
     def _points(self, fields: dict[str, Float]) -> MarkedPoints:
-        a, b, c = (fields[name] for name in self._place)
-        own = a, b, c
-        if self._place == _SPHERICAL:  # range, azimuth, elevation
-            across = a * np.cos(c)
-            own = across * np.cos(b), across * np.sin(b), a * np.sin(c)
-        positions = np.stack(own, axis=1) @ self._rotation.T + self._translation
+        own = [fields[name] for name in self._place]
+        if self._place == _SPHERICAL:
+            distance, azimuth, elevation = own
+            across = distance * np.cos(elevation)
+            own = [
+                across * np.cos(azimuth),
+                across * np.sin(azimuth),
+                distance * np.sin(elevation),
+            ]
+        turned = np.stack(own, axis=1) @ self._rotation.T
+        positions = turned + self._translation
         names = self._color + self.also
         colors = np.zeros((len(positions), len(names)), np.float32)
         for channel, name in enumerate(names):
             colors[:, channel] = fields[name]
         noise = ~np.any(own, axis=0)  # relative to the scanner: no return
         for name in self._marks():
+            marked = fields[name] != 0
             if name in _UNSEEN.get(self._color, ()):
-                colors[fields[name] != 0, : len(self._color)] = 0
+                colors[marked, : len(self._color)] = 0
             else:
-                noise |= fields[name] != 0
+                noise |= marked
         return positions, colors, noise
 
 
@@ -202,8 +216,10 @@ def _limits(header: Any, name: str) -> tuple[float, float] | None:
 
 def _images(file: Any) -> list[Any]:
     root = file.image_file.root()
-    count = root["images2D"].childCount() if root.isDefined("images2D") else 0
-    return [root["images2D"][i] for i in range(count)]
+    if not root.isDefined("images2D"):
+        return []
+    images = root["images2D"]
+    return [images[i] for i in range(images.childCount())]
 
 
 @contextmanager
@@ -243,18 +259,25 @@ def read(views: ViewFiles) -> Listed:
         found = [_frame(number, node, folder) for number, node in enumerate(nodes)]
     frames = [frame for frame in found if isinstance(frame, Frame)]
     left_out = [reason for reason in found if isinstance(reason, str)]
+    listed = Listed(path, frames)
+    if not left_out:
+        return listed
     if not frames:
-        raise InputError(f"none of its {plural(len(nodes), 'photo')} can be used: {left_out[0]}")
-    first = left_out[0] if left_out else ""
-    text = f"{plural(len(left_out), 'photo')} of {len(nodes)} left out: {first}"
-    return Listed(path, frames).noted("left_out_photos", len(left_out), text)
+        photos = plural(len(nodes), "photo")
+        raise InputError(f"none of its {photos} can be used: {left_out[0]}")
+    photos = plural(len(left_out), "photo")
+    text = f"{photos} of {len(nodes)} left out: {left_out[0]}"
+    return listed.noted("left_out_photos", len(left_out), text)
 
 
 def _frame(number: int, node: Any, folder: Path) -> Frame | str:
     """Return the view of a photo, or the reason why it cannot be used."""
-    named = str(node["name"].value()) if node.isDefined("name") else ""
-    plain = _NO_NAME.sub("_", named).strip("_.")[:80]
-    stem = f"{number:04d}_{plain}" if plain else f"{number:04d}"
+    stem = f"{number:04d}"
+    if node.isDefined("name"):
+        named = str(node["name"].value())
+        plain = _NO_NAME.sub("_", named).strip("_.")[:80]
+        if plain:
+            stem += f"_{plain}"
     kind = next((k for k in ("spherical", "pinhole") if node.isDefined(f"{k}Representation")), None)
     if kind is None:
         return f"{stem} has no spherical or pinhole representation"
@@ -286,13 +309,20 @@ def _frame(number: int, node: Any, folder: Path) -> Frame | str:
     if blob is None:
         return f"{stem} has no JPEG or PNG"
     photo = _copied(shown[blob], folder / f"{stem}{_SUFFIXES[blob]}")
+    mask = None
     if shown.isDefined("imageMask"):
         mask = _copied(shown["imageMask"], folder / "masks" / f"{stem}.png")
-    else:
-        mask = None
-    world_from_camera = _pose(node["pose"]) @ (_PANORAMA_AXES if kind == "spherical" else FLIP)
+    axes = FLIP
+    if kind == "spherical":
+        axes = _PANORAMA_AXES
+    world_from_camera = _pose(node["pose"]) @ axes
     return Frame(
-        photo.name, invert_pose(world_from_camera), lens, photo, mask=mask, listed=photo.name
+        photo.name,
+        invert_pose(world_from_camera),
+        lens,
+        photo,
+        mask=mask,
+        listed=photo.name,
     )
 
 

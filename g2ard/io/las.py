@@ -26,7 +26,11 @@ _SAMPLE_ROWS = 5000  # points of each of these runs
 _NOISE = (7, 18)  # classes of low and high noise
 
 
-_NOTHING = np.zeros((0, 3)), np.zeros((0, 0), np.float32), np.zeros(0, bool)
+_NOTHING = (
+    np.zeros((0, 3)),
+    np.zeros((0, 0), np.float32),
+    np.zeros(0, bool),
+)
 _RGB = ("red", "green", "blue")
 
 
@@ -41,24 +45,33 @@ class Stream(PointStream):
             count = reader.header.point_count
             header = reader.header
             self.fields = tuple(header.point_format.dimension_names)
-            choices = [
-                names for names in (_RGB, ("intensity",)) if {*self.fields}.issuperset(names)
-            ]
+            fields = set(self.fields)
+            choices = list(filter(fields.issuperset, (_RGB, ("intensity",))))
             runs = []
-            for first in (
-                sorted({count * part // _SAMPLES for part in range(_SAMPLES)}) if count else []
-            ):
+            starts = set[int]()
+            if count:
+                starts = {count * part // _SAMPLES for part in range(_SAMPLES)}
+            for first in sorted(starts):
                 reader.seek(first)
                 runs.append(reader.read_points(min(_SAMPLE_ROWS, count - first)))
-            text = f"the header states 0 points; {count:,} follow, and are read"
-            notes = (Note("header_count", count, text),) if reader.recovered else ()
+            notes = list[Note]()
+            if reader.recovered:
+                text = f"the header states 0 points; {count:,} follow, and are read"
+                notes.append(Note("header_count", count, text))
             system, metres_per_unit = _map_of(header)
 
         def sampled(color: Names) -> list[MarkedPoints]:
             return [_points(run, color) for run in runs] or [_NOTHING]
 
         self._color, sample = telling(choices, sampled)
-        super().__init__(path, count, sample, full_scales(np.dtype(np.uint16)), notes=notes)
+        scales = full_scales(np.dtype(np.uint16))
+        super().__init__(
+            path,
+            count,
+            sample,
+            scales,
+            notes=tuple(notes),
+        )
         self.system = system
         self.axes = "RFU"
         self.metres_per_unit = metres_per_unit
@@ -79,15 +92,19 @@ class Stream(PointStream):
 
 
 def _points(las: Any, color: Names) -> MarkedPoints:
-    positions = np.stack([np.asarray(las[name], float) for name in ("x", "y", "z")], axis=1)
-    values = np.stack([np.asarray(las[name], np.float32) for name in color], axis=1)
-    noise = np.isin(np.asarray(las["classification"]), _NOISE)
+    places = [np.asarray(las[axis], float) for axis in "xyz"]
+    columns = [np.asarray(las[name], np.float32) for name in color]
+    noise = np.isin(las["classification"], _NOISE)
     noise |= np.asarray(las["withheld"], bool)
-    return positions, values, noise
+    return np.stack(places, axis=1), np.stack(columns, axis=1), noise
 
 
 # code of a unit of length in GeoTIFF keys → its metres
-_UNITS = {9001: 1.0, 9002: 0.3048, 9003: 1200 / 3937}
+_UNITS = {
+    9001: 1.0,
+    9002: 0.3048,
+    9003: 1200 / 3937,
+}
 
 
 def _map_of(header: Any) -> tuple[str | None, float | None]:
@@ -100,10 +117,13 @@ def _map_of(header: Any) -> tuple[str | None, float | None]:
             systems += [
                 f"EPSG:{codes[key]}" for key in (3072, 2048) if 0 < codes.get(key, 0) < 32767
             ]
-            units += [_UNITS[codes[3076]]] if codes.get(3076) in _UNITS else []
+            if codes.get(3076) in _UNITS:
+                units.append(_UNITS[codes[3076]])
         if record.record_id == 2112 and hasattr(record, "string"):
             for name, rest in re.findall(
-                r'PROJ(?:CS|CRS)\["([^"]+)"(.*)', record.string, re.DOTALL
+                r'PROJ(?:CS|CRS)\["([^"]+)"(.*)',
+                record.string,
+                re.DOTALL,
             ):
                 own = re.split(r"VERT_?C(?:S|RS)\[", rest)[0]
                 code = re.search(r'(?:AUTHORITY|ID)\["EPSG",\s*"?(\d+)"?\][\]\s,\0]*$', own)
@@ -123,9 +143,12 @@ def _opened(path: Path) -> Iterator[Any]:
             with laspy.open(path) as reader:
                 header = reader.header
                 reader.recovered = _recovered(path, header)
-                for name, values in (("scale", header.scales), ("offset", header.offsets)):
-                    if not np.isfinite(values).all() or (name == "scale" and not values.all()):
-                        raise damaged(f"broken header: its {name}s are {values.tolist()}")
+                scales = header.scales
+                offsets = header.offsets
+                if not np.isfinite(scales).all() or not scales.all():
+                    raise damaged(f"broken header: its scales are {scales.tolist()}")
+                if not np.isfinite(offsets).all():
+                    raise damaged(f"broken header: its offsets are {offsets.tolist()}")
                 if header.are_points_compressed:
                     _check_chunk_table(path, header.offset_to_point_data, header.point_count)
                     _check_chunks(path, header)
@@ -135,14 +158,12 @@ def _opened(path: Path) -> Iterator[Any]:
                 yield reader
         except (InputError, GeneratorExit):
             raise
-        except (
-            BaseException
-        ) as error:  # laspy raises any exception for damaged files, and lazrs may panic
-            if not isinstance(error, Exception) and type(error).__name__ != "PanicException":
+        except BaseException as error:
+            # laspy raises any exception for damaged files, and lazrs may panic
+            kind = type(error).__name__
+            if not isinstance(error, Exception) and kind != "PanicException":
                 raise
-            raise InputError(
-                f"cannot be read as LAS: {str(error) or type(error).__name__}"
-            ) from error
+            raise InputError(f"cannot be read as LAS: {str(error) or kind}") from error
 
 
 def _number(path: Path, at: int, kind: str) -> Any:
@@ -175,11 +196,14 @@ def _recovered(path: Path, header: Any) -> bool:
 
 def _check_records(path: Path) -> None:
     """Check the number of variable-length records against the file's size, since laspy tries to read all."""
-    if (begin := _number(path, 0, "4s")) != b"LASF":
+    begin = _number(path, 0, "4s")
+    if begin != b"LASF":
         raise InputError(f"cannot be read as LAS (begins with {begin!r})")
     points_at = _number(path, 96, "<I")
     records = _number(path, 100, "<I")
-    extended = _number(path, 243, "<I") if _number(path, 25, "<B") >= 4 else 0
+    extended = 0
+    if _number(path, 25, "<B") >= 4:
+        extended = _number(path, 243, "<I")
     size = path.stat().st_size
     if points_at > size:
         raise damaged(f"truncated: points begin at byte {points_at:,} of {size:,}")
@@ -226,11 +250,12 @@ def _check_chunks(path: Path, header: Any) -> None:
     with path.open("rb") as file:
         file.seek(header.offset_to_point_data)
         table = lazrs.read_chunk_table(file, layout)
-    room, taken = (sum(column) for column in zip(*table, strict=True)) if table else (0, 0)
     there = path.stat().st_size
-    least = min((packed for _, packed in table), default=0)
-    if least < 0 or taken > there - header.offset_to_point_data:
+    sizes = [packed for _, packed in table]
+    taken = sum(sizes)
+    if min(sizes, default=0) < 0 or taken > there - header.offset_to_point_data:
         raise damaged(f"broken chunk table: chunks of {taken:,} bytes")
+    room = sum(points for points, _ in table)
     if room < header.point_count:
         raise damaged(f"truncated: at most {room:,} of {header.point_count:,} points")
     check_unpacked(there, header.point_count * size)

@@ -40,15 +40,22 @@ class Stream(HeldPoints):
         if path.is_dir() or path.stem.lower() != "points3d":
             file = points_file(path)
             if file is None or not file.is_file():
-                raise InputError(
-                    "has no points3D.bin or points3D.txt", path=model_folder(path) or path
-                )
+                place = model_folder(path) or path
+                raise InputError("has no points3D.bin or points3D.txt", path=place)
             path = file
         with parsing(path):
-            self._numbers = numbers_of(path.parent, names) if names else set()
-            rows = (_binary if path.suffix.lower() == ".bin" else _text)(path, self._numbers)
-        whole = (rows[:, 3:] == np.rint(rows[:, 3:])).all()
-        super().__init__(path, rows[:, :3], rows[:, 3:], (255.0,) if whole else (1.0, 255.0))
+            self._numbers = set[int]()
+            if names:
+                self._numbers = numbers_of(path.parent, names)
+            if path.suffix.lower() == ".bin":
+                rows = _binary(path, self._numbers)
+            else:
+                rows = _text(path, self._numbers)
+        colors = rows[:, 3:]
+        scales: tuple[float, ...] = (1.0, 255.0)
+        if (colors == np.rint(colors)).all():
+            scales = (255.0,)
+        super().__init__(path, rows[:, :3], colors, scales)
         self.axes = self.axes or "RDF"
 
     def identity(self) -> list[Any]:
@@ -66,33 +73,37 @@ def _binary(path: Path, numbers: set[int]) -> Float:
     rows = np.empty((count, 6))
     for _ in table:
         _key, *row, _error, track = table.take(_POINT)
-        seen = struct.unpack(f"<{2 * track}I", table.skip(8 * track, "TRACK"))[::2]
-        if _is_placed(seen, numbers):
-            rows[kept], kept = row, kept + 1
+        pairs = struct.unpack(f"<{2 * track}I", table.skip(8 * track, "TRACK"))
+        if _is_placed(pairs[::2], numbers):
+            rows[kept] = row
+            kept += 1
     return rows[:kept]
 
 
 def _text(path: Path, numbers: set[int]) -> Float:
     """Read the same from text, whose colours must be those of bytes."""
     table = TextTable(path, "point")
-    lines = [
-        " ".join(table.words[1:7])
-        for _ in table
-        if _is_placed(map(int, " ".join(table.words[7:]).split()[1::2]), numbers)
-    ]
+    lines = []
+    for _ in table:
+        pairs = " ".join(table.words[7:]).split()[1:]
+        if _is_placed(map(int, pairs[::2]), numbers):
+            lines.append(" ".join(table.words[1:7]))
     try:
         rows = np.loadtxt(lines, ndmin=2).reshape(len(lines), 6)
     except ValueError:  # find the wrong number
         table = TextTable(path, "point")
         rows = np.array([table.take(_NUMBERS)[1:] for _ in table])
-    inside = (rows[:, 3:] >= 0) & (rows[:, 3:] <= 255)
+    colors = rows[:, 3:]
+    inside = (colors >= 0) & (colors <= 255)
     for i, channel in np.argwhere(~inside)[:1].tolist():
-        found = rows[i, 3 + channel]
-        raise Place(path, i, "point", "RGB"[channel]).error(f"is {found:g}, expected 0 to 255")
+        place = Place(path, i, "point", "RGB"[channel])
+        raise place.error(f"is {colors[i, channel]:g}, expected 0 to 255")
     return rows
 
 
 def _is_placed(seen: Iterable[int], numbers: set[int]) -> bool:
     """Return whether enough of some images see a point, or no image does, or any may."""
-    track = set(seen) if numbers else set()
+    if not numbers:
+        return True
+    track = set(seen)
     return not track or len(track & numbers) >= _LEAST_IMAGES

@@ -82,7 +82,10 @@ class Stream(ABC, Generic[Block]):
         self.count = count
         self.notes = notes
         self.tally = Tally(item)
-        self.offset = np.zeros(3) if offset is None else offset
+        if offset is None:
+            self.offset = np.zeros(3)
+        else:
+            self.offset = offset
 
     def __len__(self) -> int:
         return self.count
@@ -101,7 +104,8 @@ class Stream(ABC, Generic[Block]):
         vars(self).update(state)
         for name, rows in state.items():
             if isinstance(rows, _Mapped):
-                setattr(self, name, np.memmap(rows.file, rows.dtype, "r", rows.offset, rows.shape))
+                mapped = np.memmap(rows.file, rows.dtype, "r", rows.offset, rows.shape)
+                setattr(self, name, mapped)
         self._is_copy = True
 
     def absolute(self) -> Self:
@@ -118,7 +122,13 @@ class Stream(ABC, Generic[Block]):
         """Return the first and last rows of parts, of about `rows` rows each, see `part`."""
         return ranges([self.count], rows)
 
-    def part(self, kind: Read, rows: int, first: int, last: int) -> Iterator[Any]:
+    def part(
+        self,
+        kind: Read,
+        rows: int,
+        first: int,
+        last: int,
+    ) -> Iterator[Any]:
         """Yield the `blocks` or `positions` of one of `parts(rows)`; `tallies` then count its rows.
 
         Parts that are read one after the other are read in one pass.
@@ -138,9 +148,9 @@ class Stream(ABC, Generic[Block]):
                 raise InputError("was changed while it was read", path=self.path)
             yield block
             if kind == "positions":
-                at = at + len(block)
+                at += len(block)
             else:
-                at = first + sum(t.rows for t in self.tallies())
+                at = first + sum(tally.rows for tally in self.tallies())
         # which would hold itself, and the file, in memory
         if last < self.count and not self._is_copy:
             self._reading = (kind, last), blocks
@@ -197,8 +207,9 @@ class SceneStream(Stream[Splats]):
         raw = Raw.empty(self.count, (self.sh_degree + 1) ** 2 - 1)
         kept = 0
         for block in self.blocks(BLOCK):
-            rows = raw.take(slice(kept, kept := kept + len(block)))
-            rows.fill(getattr(block, name) for name in ARRAYS)
+            rows = slice(kept, kept + len(block))
+            raw.take(rows).fill(getattr(block, name) for name in ARRAYS)
+            kept = rows.stop
         self.all_notes()  # raises if no row is finite
         return self.placed(raw.take(slice(kept)))
 
@@ -221,7 +232,8 @@ class RawStream(SceneStream):
         """Return stored means in the scene's axes."""
         if self.axes == "RDF":
             return means
-        return np.asarray(means @ change_of_axes("RDF", self.axes).T.astype(np.float32), np.float32)
+        turn = change_of_axes("RDF", self.axes).astype(np.float32)
+        return np.asarray(means @ turn.T, np.float32)
 
     @abstractmethod
     def raw(self, rows: int, start: int) -> Iterator[Raw]:
@@ -234,9 +246,12 @@ class RawStream(SceneStream):
         for raw in self.raw(rows, start):
             before = self.tally.dropped
             keep = self.tally.clean(raw)
-            splats = restored(raw.activated(self.render_model, np.zeros(3)), self.axes)
-            splats = stand_as(replace(splats, offset=self.offset), self)
-            yield splats if self.tally.dropped == before else splats.take(keep)
+            stored = raw.activated(self.render_model, np.zeros(3))
+            splats = replace(restored(stored, self.axes), offset=self.offset)
+            splats = stand_as(splats, self)
+            if self.tally.dropped > before:
+                splats = splats.take(keep)
+            yield splats
 
 
 class PartsStream(SceneStream):
@@ -257,7 +272,14 @@ class PartsStream(SceneStream):
         notes: Notes = (),
         render_model: RenderModel = "classic",
     ) -> None:
-        super().__init__(path, sum(counts), (sh_degree + 1) ** 2 - 1, offset, notes, render_model)
+        super().__init__(
+            path,
+            sum(counts),
+            (sh_degree + 1) ** 2 - 1,
+            offset,
+            notes,
+            render_model,
+        )
         self.counts = counts
         self._part = part
         self._identity = identity
@@ -266,7 +288,12 @@ class PartsStream(SceneStream):
     def of(cls, path: Path, splats: Splats, notes: Notes) -> PartsStream:
         """Return the scene of a file that was read as a whole."""
         stream = cls(
-            path, [len(splats)], lambda _: splats, splats.sh_degree, splats.offset, notes=notes
+            path,
+            [len(splats)],
+            lambda _: splats,
+            splats.sh_degree,
+            splats.offset,
+            notes=notes,
         )
         stream.render_model = splats.render_model
         stream.up = splats.up
@@ -345,9 +372,11 @@ class PointStream(Stream[RawPoints]):
         extent = high - low
         size = np.linalg.norm(extent)
         farthest = np.abs(middle).max()
-        far = np.isfinite(middle).all() and farthest > size
-        zeros = int(np.count_nonzero(good & ~placed))
-        away = bool(farthest > _FAR * size and extent.any())
+        offset = None
+        if np.isfinite(middle).all() and farthest > size:
+            offset = np.rint(middle)
+        zeros = np.count_nonzero(good & ~placed)
+        away = farthest > _FAR * size and extent.any()
         self._zeros_are_lost = away or zeros > max(_FEW_BLACK, _BLACK_SHARE * len(good))
         if self._zeros_are_lost and placed.any():
             good = placed
@@ -355,29 +384,34 @@ class PointStream(Stream[RawPoints]):
         notes = (*notes, *note_coarse(self.sample, spacing(self.sample, count)))
         if _in_degrees(middle, extent):
             notes = (*notes, _DEGREES)
-        super().__init__(path, count, np.rint(middle) if far else None, notes, "point")
+        super().__init__(path, count, offset, notes, "point")
         self.channels = values.shape[1]
         self.scales = scales
         self.lack = "has neither colours nor intensities that vary"
         self.todo = ""
         self.system: str | None = None
         self.metres_per_unit: float | None = None
-        self.axes: Axes | None = "RFU" if far else None
-        self._range = 0.0, 1.0
+        self.axes: Axes | None = None
+        if offset is not None:
+            self.axes = "RFU"
+        self._dark = 0.0
+        self._full = 1.0
         if self.channels == 3:
-            self._range = 0.0, choose_white(values[good], scales)
+            self._full = choose_white(values[good], scales)
         elif self.channels == 1:
-            self._range = choose_shades(values[good], limits)
-            self.channels = int(self._range[0] < self._range[1])
+            self._dark, self._full = choose_shades(values[good], limits)
+            self.channels = int(self._dark < self._full)
 
     def shown(self, values: Float32) -> Float32:
         """Return stored values as (n, 3) colours in [0, 1]."""
         if not self.channels:
             return np.zeros((len(values), 3), np.float32)
-        dark, full = self._range
+        dark = np.float32(self._dark)
+        extent = np.float32(self._full - self._dark)
         with np.errstate(invalid="ignore"):
-            shades = (values - np.float32(dark)) / np.float32(full - dark)
-        self.tally.bright += int(np.count_nonzero((shades > HDR).any(axis=1)))
+            shades = (values - dark) / extent
+        bright = (shades > HDR).any(axis=1)
+        self.tally.bright += int(np.count_nonzero(bright))
         return np.broadcast_to(np.clip(shades, 0, 1), (len(values), 3))
 
     @abstractmethod
@@ -387,34 +421,42 @@ class PointStream(Stream[RawPoints]):
     def marked(self, rows: int, start: int) -> Iterator[MarkedPoints]:
         """Yield `raw` with points as noise that scanners store at 0 0 0 for want of a return."""
         for positions, values, noise in self.raw(rows, start):
-            yield (
-                positions,
-                values,
-                noise | ~positions.any(axis=1) if self._zeros_are_lost else noise,
-            )
+            if self._zeros_are_lost:
+                noise = noise | ~positions.any(axis=1)
+            yield positions, values, noise
 
     def header_notes(self) -> Notes:
-        notes = list(self.notes)
-        dark, full = self._range
-        rows = self.tally.rows - self.tally.dropped - self.tally.noise
+        tally = self.tally
+        rows = tally.rows - tally.dropped - tally.noise
         if not rows:
-            return tuple(notes)
+            return self.notes
+        notes = list(self.notes)
+        full = self._full
         if self.channels == 1:
-            text = f"no colours; intensities of {dark:g} to {full:g} are shown as grey"
+            text = f"no colours; intensities of {self._dark:g} to {full:g} are shown as grey"
             notes.append(Note("grey", rows, text))
-        elif self.tally.black == rows:
-            text = "all colours are 0; add colours, for example with PDAL's filters.colorization"
-            notes.append(Note("black", rows, text if self.channels else "no colours"))
-        elif self.tally.black > max(_FEW_BLACK, _BLACK_SHARE * rows):
-            text = f"{plural(self.tally.black, 'point')} are black, perhaps without colours"
-            notes.append(Note("black_points", self.tally.black, text))
-        if self.channels == 3 and 1 < full < self.scales[-1]:
+        elif tally.black == rows:
+            text = "no colours"
+            if self.channels:
+                text = (
+                    "all colours are 0; add colours, for example with PDAL's filters.colorization"
+                )
+            notes.append(Note("black", rows, text))
+        elif tally.black > max(_FEW_BLACK, _BLACK_SHARE * rows):
+            text = f"{plural(tally.black, 'point')} are black, perhaps without colours"
+            notes.append(Note("black_points", tally.black, text))
+        if self.channels != 3:
+            return tuple(notes)
+        if 1 < full < self.scales[-1]:
+            code = "color_range"
+            if full == 255:
+                code = "eight_bit_colors"
             text = f"colours up to {full:,.0f} in fields of a larger range"
-            notes.append(Note("eight_bit_colors" if full == 255 else "color_range", rows, text))
-        if self.channels == 3 and self.tally.bright:
-            bright = plural(self.tally.bright, "point")
-            text = f"{bright} brighter than the range of most colours taken as white"
-            notes.append(Note("bright_points", self.tally.bright, text))
+            notes.append(Note(code, rows, text))
+        if tally.bright:
+            points = plural(tally.bright, "point")
+            text = f"{points} brighter than the range of most colours taken as white"
+            notes.append(Note("bright_points", tally.bright, text))
         return tuple(notes)
 
     def near(self, positions: Float) -> Float32:
@@ -435,7 +477,8 @@ class PointStream(Stream[RawPoints]):
                 positions = positions[good]
                 values = values[good]
             colors = self.shown(values)
-            self.tally.black += int(np.count_nonzero(colors.max(axis=1, initial=0) < _BLACK))
+            black = colors.max(axis=1, initial=0) < _BLACK
+            self.tally.black += int(np.count_nonzero(black))
             yield positions, colors
 
     def whole(self) -> Cloud:
@@ -444,11 +487,13 @@ class PointStream(Stream[RawPoints]):
         colors = np.empty((self.count, 3), np.float32)
         kept = 0
         for block in self.blocks(_POINTS_AT_ONCE):
-            rows = slice(kept, kept := kept + len(block[0]))
+            rows = slice(kept, kept + len(block[0]))
             positions[rows], colors[rows] = block
+            kept = rows.stop
         notes = self.all_notes()
         colors = colors[:kept]
-        colored = (colors.max(axis=1, initial=0) >= _BLACK) & (self.channels == 3)
+        lit = colors.max(axis=1, initial=0) >= _BLACK
+        colored = lit & (self.channels == 3)
         return Cloud(Points(positions[:kept], colors), notes, colored, self.axes)
 
 
@@ -463,7 +508,8 @@ class HeldPoints(PointStream):
         scales: Sequence[float],
         columns: Mapping[str, Values] = MappingProxyType({}),
     ) -> None:
-        self._held = positions, values.astype(np.float32), np.zeros(len(positions), bool)
+        noise = np.zeros(len(positions), bool)
+        self._held = positions, values.astype(np.float32), noise
         self.fields = tuple(columns)
         self._columns = columns
         super().__init__(path, len(positions), self._held, scales)
@@ -490,7 +536,9 @@ def _in_degrees(middle: Float, extent: Float) -> bool:
     wide = float(extent[:2].max())
     low, high = sorted(np.abs(middle[:2]))
     on_globe = low <= 90 and high <= 180
-    return bool(on_globe and high > _FAR * wide and extent[2] > _STEEP * wide)
+    is_far = high > _FAR * wide
+    is_steep = extent[2] > _STEEP * wide
+    return bool(on_globe and is_far and is_steep)
 
 
 class Joined(Stream[Block]):
@@ -517,9 +565,9 @@ class Joined(Stream[Block]):
     def header_notes(self) -> Notes:
         notes = []
         for stream in self.streams:
-            notes += [
-                replace(note, text=f"{stream.path}: {note}") for note in stream.header_notes()
-            ]
+            for note in stream.header_notes():
+                text = f"{stream.path}: {note}"
+                notes.append(replace(note, text=text))
         return tuple(notes)
 
     def _from(self, start: int) -> Iterator[tuple[int, int]]:
@@ -534,13 +582,18 @@ class JoinedScenes(Joined[Splats], SceneStream):
     def __init__(self, streams: Sequence[SceneStream]) -> None:
         self.streams = streams
         rest = (max(stream.sh_degree for stream in streams) + 1) ** 2 - 1
-        count = sum(s.count for s in streams)
-        model = one_model([s.render_model for s in streams])
+        first = streams[0]
         SceneStream.__init__(
-            self, streams[0].path, count, rest, streams[0].offset, render_model=model
+            self,
+            first.path,
+            sum(stream.count for stream in streams),
+            rest,
+            first.offset,
+            render_model=one_model([stream.render_model for stream in streams]),
         )
         ups = {stream.up for stream in streams}
-        self.up = ups.pop() if len(ups) == 1 else None
+        if len(ups) == 1:
+            self.up = ups.pop()
         self.axes = common_axes([stream.axes for stream in streams])
 
     def positions(self, rows: int, start: int = 0) -> Iterator[Float32]:
@@ -554,8 +607,9 @@ class JoinedScenes(Joined[Splats], SceneStream):
             stream = self.streams[number]
             stream.tally = self.tally
             for block in stream.blocks(rows, begin):
+                block = block.with_sh_degree(self.sh_degree)
                 means = self._moved(block.means, stream.offset)
-                yield replace(block.with_sh_degree(self.sh_degree), means=means, offset=self.offset)
+                yield replace(block, means=means, offset=self.offset)
 
     def _moved(self, means: Float32, offset: Float) -> Float32:
         shift = offset - self.offset
@@ -586,12 +640,12 @@ class JoinedClouds(Joined[RawPoints], PointStream):
             self.axes = streams[0].axes
         stated = {stream.system: stream.path.name for stream in reversed(streams) if stream.system}
         if len(stated) > 1:
-            words = ", ".join(f"{name} in {system}" for system, name in reversed(stated.items()))
-            raise InputError(
-                f"several map systems: {words}; project all to one first", path=streams[0].path
-            )
+            named = [f"{name} in {system}" for system, name in reversed(stated.items())]
+            text = f"several map systems: {', '.join(named)}; project all to one first"
+            raise InputError(text, path=streams[0].path)
         self.system = next(iter(stated), None)
-        self.metres_per_unit = next((s.metres_per_unit for s in streams if s.metres_per_unit), None)
+        units = filter(None, (stream.metres_per_unit for stream in streams))
+        self.metres_per_unit = next(units, None)
         self.notes = tuple(_far_apart(streams))
 
     def header_notes(self) -> Notes:
@@ -634,7 +688,9 @@ def _far_apart(streams: Sequence[PointStream]) -> Iterator[Note]:
     lows, highs = boxes.swapaxes(0, 1)
     size = (highs - lows).max()
     for number, stream in enumerate(placed):
-        gaps = np.maximum(lows[number] - highs, lows - highs[number]).max(axis=1)
+        above = lows[number] - highs
+        below = lows - highs[number]
+        gaps = np.maximum(above, below).max(axis=1)
         nearest = np.delete(gaps, number).min()
         if nearest > _APART * size > 0:
             text = f"{stream.path.name} lies {nearest:,.0f} units from the others, "
@@ -652,13 +708,13 @@ def telling(
     """
     found = []
     for names in choices or [()]:
-        positions, values, noise = (
-            np.concatenate(column) for column in zip(*read(names), strict=True)
-        )
+        columns = zip(*read(names), strict=True)
+        positions, values, noise = map(np.concatenate, columns)
         found.append((names, (positions, values, noise)))
-    for each in found:
-        if has_contrast(each[1][1][~each[1][2]]):
-            return each
+    for names, sample in found:
+        _, values, noise = sample
+        if has_contrast(values[~noise]):
+            return names, sample
     return found[0]
 
 

@@ -151,19 +151,19 @@ class TileStore:
         except (TypeError, ValueError, RecursionError) as error:
             raise place.to("cells").error(f"is not a tree ({error})") from error
         if tree.leaves != len(manifest.tiles):
-            raise place.to("cells").error(
-                f"has {tree.leaves} leaves for {len(manifest.tiles)} tiles"
-            )
+            text = f"has {tree.leaves} leaves for {len(manifest.tiles)} tiles"
+            raise place.to("cells").error(text)
         if sum(tile.rows for tile in manifest.tiles) != manifest.count:
-            raise place.to("count").error(
-                f"is {manifest.count}, which is not the sum of the tiles' rows"
-            )
+            text = f"is {manifest.count}, which is not the sum of the tiles' rows"
+            raise place.to("count").error(text)
         with_index = msgspec.structs.replace
-        tiles = tuple(with_index(tile, index=i) for i, tile in enumerate(manifest.tiles))
-        values |= {"tiles": tiles, "offset": np.array(manifest.offset)}
+        tiles = [with_index(tile, index=i) for i, tile in enumerate(manifest.tiles)]
+        values["tiles"] = tuple(tiles)
+        values["offset"] = np.array(manifest.offset)
         store = cls(folder, tree=tree, **values)
-        for tile in store.tiles if complete else ():
-            store._check_sizes(tile)
+        if complete:
+            for tile in tiles:
+                store._check_sizes(tile)
         return store
 
     def _check_sizes(self, tile: Tile) -> None:
@@ -232,7 +232,8 @@ class TileStore:
         rows = self.rows(index)
         crc = 0
         for start in range(0, len(rows), _ROWS_AT_ONCE):
-            crc = zlib.crc32(rows[start : start + _ROWS_AT_ONCE].data, crc)
+            block = rows[start : start + _ROWS_AT_ONCE]
+            crc = zlib.crc32(block.data, crc)
         self._check_contents(tile_name(index), crc, self.tiles[index].checks[0])
 
     def damaged(self, *, contents: bool) -> list[int]:
@@ -256,7 +257,13 @@ class TileStore:
                 path=self.folder / name,
             )
 
-    def _read(self, name: str, count: int, check: int, sh: bool) -> Splats:
+    def _read(
+        self,
+        name: str,
+        count: int,
+        check: int,
+        sh: bool,
+    ) -> Splats:
         self._check_size(name, count)
         crc = 0
 
@@ -264,7 +271,8 @@ class TileStore:
             nonlocal crc
             with (self.folder / name).open("rb") as file:
                 for start in range(0, count, _ROWS_AT_ONCE):
-                    data = file.read(self.row_bytes * min(_ROWS_AT_ONCE, count - start))
+                    rows = min(_ROWS_AT_ONCE, count - start)
+                    data = file.read(self.row_bytes * rows)
                     crc = zlib.crc32(data, crc)
                     yield np.frombuffer(data, "<f4").reshape(-1, self.row_bytes // 4)
 
@@ -272,13 +280,22 @@ class TileStore:
         self._check_contents(name, crc, check)
         return scene
 
-    def unpacked(self, count: int, blocks: Iterable[Float32], *, sh: bool = True) -> Splats:
+    def unpacked(
+        self,
+        count: int,
+        blocks: Iterable[Float32],
+        *,
+        sh: bool = True,
+    ) -> Splats:
         """Return the scene of `count` packed rows, given in blocks; `sh` as for `read`."""
-        rest = (self.sh_degree + 1) ** 2 - 1 if sh else 0
+        rest = 0
+        if sh:
+            rest = (self.sh_degree + 1) ** 2 - 1
         raw = Raw.empty(count, rest)
         start = 0
         for rows in blocks:
-            part = raw.take(slice(start, start := start + len(rows)))
+            part = raw.take(slice(start, start + len(rows)))
+            start += len(rows)
             part.means[:] = rows[:, :3]
             part.quats[:] = rows[:, 3:7]
             part.log_scales[:] = rows[:, 7:10]
@@ -313,10 +330,18 @@ class Stream(PartsStream):
     """Tiles of a folder as a scene, read one at a time."""
 
     def __init__(self, path: Path) -> None:
-        self.store = store = TileStore.open(path)
-        counts = [tile.rows for tile in store.tiles]
-        parts = counts, store.read, store.sh_degree, store.offset
-        super().__init__(path, *parts, [store.key], store.notes, store.render_model)
+        store = TileStore.open(path)
+        super().__init__(
+            path,
+            [tile.rows for tile in store.tiles],
+            store.read,
+            store.sh_degree,
+            store.offset,
+            [store.key],
+            store.notes,
+            store.render_model,
+        )
+        self.store = store
         self.up = store.up
         self.axes = store.axes
 

@@ -177,7 +177,7 @@ class ChosenPoints(PointStream):
                 text = f"colours nothing: it is {found[0, 0]:g} at all points"
                 raise InputError(text, path=stream.path, property=self._shade)
             self.channels = 1
-            self._range = choose_shades(found)
+            self._dark, self._full = choose_shades(found)
 
     def identity(self) -> list[Any]:
         return [*self._whole.identity(), list(astuple(self._choice))]
