@@ -31,7 +31,11 @@ def check_animation(path: Path) -> None:
 
 
 def write_animation(
-    path: Path, pictures: Iterable[Bytes], *, fps: float = 25, overwrite: bool = False
+    path: Path,
+    pictures: Iterable[Bytes],
+    *,
+    fps: float = 25,
+    overwrite: bool = False,
 ) -> None:
     """Write images of one size as an endless animation in the format of the suffix.
 
@@ -52,10 +56,19 @@ def write_animation(
             "quality": 80,
             "optimize": True,
         }
-        image.save(temporary, save_all=True, append_images=rest, **options)
+        image.save(
+            temporary,
+            save_all=True,
+            append_images=rest,
+            **options,
+        )
 
 
-def _check_sizes(path: Path, shape: tuple[int, ...], frames: Iterable[Bytes]) -> Iterator[Bytes]:
+def _check_sizes(
+    path: Path,
+    shape: tuple[int, ...],
+    frames: Iterable[Bytes],
+) -> Iterator[Bytes]:
     for frame in frames:
         if frame.shape != shape:
             sizes = f"{shape[1]}×{shape[0]} and {frame.shape[1]}×{frame.shape[0]}"
@@ -63,7 +76,12 @@ def _check_sizes(path: Path, shape: tuple[int, ...], frames: Iterable[Bytes]) ->
         yield np.ascontiguousarray(frame)
 
 
-def _encode(path: Path, size: Size, frames: Iterable[Bytes], fps: float) -> None:
+def _encode(
+    path: Path,
+    size: Size,
+    frames: Iterable[Bytes],
+    fps: float,
+) -> None:
     """Pipe raw frames to ffmpeg; H.264 with 4:2:0 needs even sides, so odd ones lose a pixel."""
     command = ["ffmpeg", "-y", "-loglevel", "error", "-f", "rawvideo", "-pix_fmt", "rgb24"]
     command += ["-s", f"{size[0]}x{size[1]}", "-r", f"{fps:g}", "-i", "-"]

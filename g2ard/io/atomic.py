@@ -21,7 +21,12 @@ from g2ard.io.paths import AnyPath, is_special, real_path
 _LONGEST_NAME = 255  # bytes of the longest file name of usual file systems
 
 
-def check_output(path: AnyPath, overwrite: bool = False, *, folder: bool = False) -> Path:
+def check_output(
+    path: AnyPath,
+    overwrite: bool = False,
+    *,
+    folder: bool = False,
+) -> Path:
     """Return `path`, or raise an `OutputError` if an output cannot be written there.
 
     Args:
@@ -43,9 +48,8 @@ def check_output(path: AnyPath, overwrite: bool = False, *, folder: bool = False
     except OutputError:
         raise
     except OSError as error:
-        raise OutputError(
-            f"cannot write there: {error.strerror}", path=path, hint="give another output"
-        ) from error
+        text = f"cannot write there: {error.strerror}"
+        raise OutputError(text, path=path, hint="give another output") from error
     return path
 
 

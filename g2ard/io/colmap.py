@@ -28,33 +28,43 @@ from g2ard.scene.lenses import PARAMETERS, PhotoLens
 from g2ard.scene.transform import quaternion_of
 
 _MODELS = (
-    *(
-        "SIMPLE_PINHOLE",
-        "PINHOLE",
-        "SIMPLE_RADIAL",
-        "RADIAL",
-        "OPENCV",
-        "OPENCV_FISHEYE",
-        "FULL_OPENCV",
-    ),
-    *("FOV", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "THIN_PRISM_FISHEYE"),
-    *(
-        "RAD_TAN_THIN_PRISM_FISHEYE",
-        "SIMPLE_DIVISION",
-        "DIVISION",
-        "SIMPLE_FISHEYE",
-        "FISHEYE",
-        "EUCM",
-    ),
+    "SIMPLE_PINHOLE",
+    "PINHOLE",
+    "SIMPLE_RADIAL",
+    "RADIAL",
+    "OPENCV",
+    "OPENCV_FISHEYE",
+    "FULL_OPENCV",
+    "FOV",
+    "SIMPLE_RADIAL_FISHEYE",
+    "RADIAL_FISHEYE",
+    "THIN_PRISM_FISHEYE",
+    "RAD_TAN_THIN_PRISM_FISHEYE",
+    "SIMPLE_DIVISION",
+    "DIVISION",
+    "SIMPLE_FISHEYE",
+    "FISHEYE",
+    "EUCM",
     "EQUIRECTANGULAR",
 )
 """Names of models by their number in binary tables."""
-_PINHOLES = {"SIMPLE_PINHOLE": 3, "PINHOLE": 4, "SIMPLE_RADIAL": 4, "RADIAL": 5, "OPENCV": 8}
+_PINHOLES = {
+    "SIMPLE_PINHOLE": 3,
+    "PINHOLE": 4,
+    "SIMPLE_RADIAL": 4,
+    "RADIAL": 5,
+    "OPENCV": 8,
+}
 _PARAMETERS = {**_PINHOLES, **PARAMETERS, "EQUIRECTANGULAR": 2}
 """Supported models and their number of parameters; those of a panorama are its width and height."""
 
-_MODEL_FILES = tuple(
-    f"{part}{suffix}" for suffix in (".bin", ".txt") for part in ("cameras", "images", "points3D")
+_MODEL_FILES = (
+    "cameras.bin",
+    "images.bin",
+    "points3D.bin",
+    "cameras.txt",
+    "images.txt",
+    "points3D.txt",
 )
 """Files of a model."""
 
@@ -68,8 +78,7 @@ def model_folder(path: Path) -> Path | None:
     """Return the model's folder, or None: that of `path` itself, otherwise the one with the most images in
     sparse, colmap/sparse or a numbered folder in these.
     """
-    found = _models(path)
-    return found[0] if found else None
+    return next(iter(_models(path)), None)
 
 
 def _models(path: Path) -> list[Path]:
@@ -77,7 +86,8 @@ def _models(path: Path) -> list[Path]:
     if path.is_file():
         path = path.parent
     if _tables(path):
-        return [path, *(folder for folder in _numbered(path.parent) if folder != path)]
+        beside = [folder for folder in _numbered(path.parent) if folder != path]
+        return [path, *beside]
     for sparse in (path / "sparse", path / "colmap" / "sparse"):
         folders = [folder for folder in (*_numbered(sparse), sparse) if _tables(folder)]
         if folders:
@@ -136,7 +146,9 @@ def photos_beside(path: Path) -> tuple[Path, Path] | None:
 def points_file(path: Path) -> Path | None:
     """Return the file of points of the model that `read` takes for `path`, which may not exist, or None."""
     beside = photos_beside(path)
-    folder = model_folder(beside[0] if beside else path)
+    if beside:
+        path = beside[0]
+    folder = model_folder(path)
     if folder is None:
         return None
     held = _held(folder)
@@ -188,12 +200,12 @@ def incomplete(path: Path) -> InputError | None:
         held = [name for name in _MODEL_FILES if name.lower() in names]
         if held and _tables(place) is None:
             suffix = Path(held[0]).suffix
-            lacking = [
-                f"{part}{suffix}" for part in ("cameras", "images") if f"{part}{suffix}" not in held
-            ]
-            text = f"COLMAP model without {' and '.join(lacking)}; found {', '.join(held)}"
+            needed = [f"cameras{suffix}", f"images{suffix}"]
+            lacking = " and ".join(name for name in needed if name not in held)
             return InputError(
-                text, path=place, hint="copy the whole model: cameras (lenses), images (poses)"
+                f"COLMAP model without {lacking}; found {', '.join(held)}",
+                path=place,
+                hint="copy the whole model: cameras (lenses), images (poses)",
             )
     return None
 
@@ -220,8 +232,9 @@ def read(views: ViewFiles) -> Listed:
     path = views.path
     found = listed(views)
     beside = photos_beside(path)
-    models = _models(beside[0] if beside else path)
-    others = [other for other in models if other != found.path]
+    if beside:
+        path = beside[0]
+    others = [other for other in _models(path) if other != found.path]
     if not others:
         return found
     largest = max(others, key=_count)
@@ -234,15 +247,15 @@ def listed(views: ViewFiles) -> Listed:
     """Return the frames of `read`, without a note on other models."""
     path = views.path
     images = views.images
-    if images is None and (beside := photos_beside(path)):
-        path, images = beside
+    if images is None:
+        beside = photos_beside(path)
+        if beside:
+            path, images = beside
     folder = model_folder(path)
     tables = _tables(folder) if folder else None
     if folder is None or tables is None:
-        error = incomplete(path)
-        raise error or InputError(
-            "has no COLMAP model (cameras and images, .bin or .txt)", path=path
-        )
+        text = "has no COLMAP model (cameras and images, .bin or .txt)"
+        raise incomplete(path) or InputError(text, path=path)
     with parsing(tables[0]):
         cameras = _cameras(open_table(tables[0], "camera"))
     with parsing(tables[1]):
@@ -262,10 +275,9 @@ def listed(views: ViewFiles) -> Listed:
         if isinstance(camera, InputError):
             faults.append((name, camera))
             continue
+        pose = None
         if fault is None and any(own[:4]):
             pose = make_pose(own[:4], own[4:])
-        else:
-            pose = None
         in_rig = by_rig.get((key, number))
         if in_rig is not None:
             if pose is None:
@@ -278,9 +290,12 @@ def listed(views: ViewFiles) -> Listed:
                 raise InputError(f"{name!r}: its quaternion is zero", path=tables[1])
             faults.append((name, fault))
             continue
-        frames.append(Frame(name, pose, camera, finder.photo(name), listed=name))
-    text = f"{plural(stale, 'pose')} of {tables[1].name} differ from rigs and frames, which count"
-    return Listed(folder, frames, faults, finder.notes).noted("stale_poses", stale, text)
+        photo = finder.photo(name)
+        frames.append(Frame(name, pose, camera, photo, listed=name))
+    found = Listed(folder, frames, faults, finder.notes)
+    poses = plural(stale, "pose")
+    text = f"{poses} of {tables[1].name} differ from rigs and frames, which count"
+    return found.noted("stale_poses", stale, text)
 
 
 _SAME = 1e-5  # difference of poses that rounding may cause
@@ -349,7 +364,8 @@ class Table:
         except struct.error:
             room = len(self.data) - self._at
             formats = accumulate(layout.format[1:], initial="<")
-            whole = sum(struct.calcsize(start) <= room for start in formats) - 1
+            sizes = map(struct.calcsize, formats)
+            whole = sum(size <= room for size in sizes) - 1
             raise self._cut_off(columns.names[whole]) from None
         self._at += layout.size
         return values
@@ -357,10 +373,9 @@ class Table:
     def params(self, model: str) -> tuple[str, tuple[float, ...]]:
         """Return the name of a model of cameras, and its parameters, which come next."""
         number = int(model)
+        name = f"number {number}"
         if 0 <= number < len(_MODELS):
             name = _MODELS[number]
-        else:
-            name = f"number {number}"
         count = _PARAMETERS.get(name, 0)
         return name, self.take(Columns.of(count * "d", *_params(count)))
 
@@ -379,7 +394,7 @@ class Table:
     def skip(self, size: int, name: str) -> bytes:
         """Move past the bytes of a column, and return them."""
         start = self._at
-        self._at = self._at + size
+        self._at += size
         if self._at > len(self.data):
             raise self._cut_off(name)
         return self.data[start : self._at]
@@ -395,7 +410,13 @@ class Table:
         return None
 
     def _cut_off(self, name: str) -> InputError:
-        return damaged("is cut off", path=self.path, property=name, index=self.row, item=self.item)
+        return damaged(
+            "is cut off",
+            path=self.path,
+            property=name,
+            index=self.row,
+            item=self.item,
+        )
 
 
 class TextTable(Table):
@@ -431,14 +452,17 @@ class TextTable(Table):
         self._at += 1
         if name in _WORDS:
             return word
-        if kind == "d" and (found := _NOT_FINITE.fullmatch(word)):
-            if found["inf"]:
-                return math.inf
-            return math.nan
+        if kind == "d":
+            unusual = _NOT_FINITE.fullmatch(word)
+            if unusual:
+                return math.inf if unusual["inf"] else math.nan
         try:
             if "_" in word or not word.isascii():  # Python reads both
                 raise ValueError(word)
-            value = float(word) if kind == "d" else int(word)
+            if kind == "d":
+                value = float(word)
+            else:
+                value = int(word)
             if not math.isfinite(value):
                 raise ValueError(word)
         except (ValueError, OverflowError):
@@ -468,7 +492,8 @@ _NOT_FINITE = re.compile(r"[+-]?(nan(\(.*\))?|(?P<inf>inf(inity)?)|\d\.#\w+)", r
 def _is_points(line: str) -> bool:
     """Return whether a line of images.txt has triples x, y, POINT3D_ID, unlike the line of an image."""
     words = line.split()
-    if len(words) % 3 or not all(map(_WHOLE.fullmatch, words[2::3])):
+    numbers = words[2::3]
+    if len(words) % 3 or not all(map(_WHOLE.fullmatch, numbers)):
         return False
     return all(_NUMBER.fullmatch(word) or _NOT_FINITE.fullmatch(word) for word in words[:30])
 
@@ -483,7 +508,9 @@ def _params(count: int) -> list[str]:
 
 def open_table(path: Path, item: str) -> Table:
     """Open a table, .bin or .txt."""
-    return (TextTable if path.suffix.lower() == ".txt" else Table)(path, item)
+    if path.suffix.lower() == ".txt":
+        return TextTable(path, item)
+    return Table(path, item)
 
 
 def _camera(model: str, size: tuple[int, int], p: tuple[float, ...]) -> Lens:
@@ -504,9 +531,8 @@ def _camera(model: str, size: tuple[int, int], p: tuple[float, ...]) -> Lens:
     fx, fy, cx, cy, *k = p
     if min(size) < 1 or min(fx, fy) <= 0:
         width, height = size
-        raise InputError(
-            f"invalid camera of {width:,}×{height:,} pixels and focal lengths {fx}, {fy}"
-        )
+        pixels = f"{width:,}×{height:,} pixels"
+        raise InputError(f"invalid camera of {pixels} and focal lengths {fx}, {fy}")
     distortion = (*k, 0.0, 0.0, 0.0, 0.0, 0.0)[:5]
     return Lens.pinhole(size, (fx, fy), (cx, cy), distortion)
 
@@ -552,7 +578,8 @@ def _rig_poses(folder: Path, suffix: str) -> dict[tuple[int, int], Float]:
         for _ in table:
             _key, rig, *numbers, count = table.take(_FRAME)
             from_world = _known(numbers)
-            for kind, sensor, image in [table.take(_DATA) for _ in range(count)]:
+            for _ in range(count):
+                kind, sensor, image = table.take(_DATA)
                 in_rig = None
                 if kind in _CAMERA_SENSOR:
                     in_rig = sensors.get((rig, sensor))
@@ -591,26 +618,26 @@ def texts_of(cameras: Cameras) -> dict[str, str]:
     images = []
     for i, viewmat in enumerate(cameras.viewmats):
         lens = intrinsics_of(cameras, i)
-        words = [lens[key] for key in ("w", "h", "fl_x", "fl_y", "cx", "cy")]
+        params = [lens[key] for key in ("w", "h", "fl_x", "fl_y", "cx", "cy")]
         bent = [lens[key] for key in ("k1", "k2", "p1", "p2")]
-        kind = ["OPENCV", *words, *bent] if any(bent) else ["PINHOLE", *words]
-        camera = lenses.setdefault(" ".join(map(str, kind)), len(lenses) + 1)
+        model = "PINHOLE"
+        if any(bent):
+            model = "OPENCV"
+            params += bent
+        words = " ".join(map(str, [model, *params]))
+        camera = lenses.setdefault(words, len(lenses) + 1)
         quat = quaternion_of(viewmat[:3, :3]).tolist()
         shift = viewmat[:3, 3].tolist()
-        words = [i + 1, *quat, *shift, camera, cameras.names[i]]
-        images.append(" ".join(map(str, words)) + "\n\n")
-    rows = {
-        "cameras": "".join(f"{number} {words}\n" for words, number in lenses.items()),
-        "images": "".join(images),
-        "points3D": "",
-    }
+        image = [i + 1, *quat, *shift, camera, cameras.names[i]]
+        images.append(" ".join(map(str, image)) + "\n\n")
+    rows_of_cameras = [f"{number} {words}\n" for words, number in lenses.items()]
     return {
-        f"sparse/0/{name}.txt": f"# {columns}\n{rows[name]}" for name, columns in _WRITTEN.items()
+        "sparse/0/cameras.txt": f"{_CAMERAS_HEAD}{''.join(rows_of_cameras)}",
+        "sparse/0/images.txt": f"{_IMAGES_HEAD}{''.join(images)}",
+        "sparse/0/points3D.txt": _POINTS_HEAD,
     }
 
 
-_WRITTEN = {
-    "cameras": "CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]",
-    "images": "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, then a line of POINTS2D[]",
-    "points3D": "POINT3D_ID X Y Z R G B ERROR TRACK[]",
-}
+_CAMERAS_HEAD = "# CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]\n"
+_IMAGES_HEAD = "# IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, then a line of POINTS2D[]\n"
+_POINTS_HEAD = "# POINT3D_ID X Y Z R G B ERROR TRACK[]\n"

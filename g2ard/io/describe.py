@@ -2,7 +2,7 @@
 
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -42,7 +42,9 @@ def describe(given: str | Path | ViewFiles, more: Callable[[Splats], Json] | Non
     if source.kind == "splats":
         splats = source.whole()
         notes = source.notes
-        figures = _splats(splats) | ({} if more is None else more(splats))
+        figures = _splats(splats)
+        if more is not None:
+            figures |= more(splats)
     elif source.kind == "points":
         cloud = source.cloud().whole()
         notes = cloud.notes
@@ -53,7 +55,8 @@ def describe(given: str | Path | ViewFiles, more: Callable[[Splats], Json] | Non
         notes = (*views.notes, *_photo_notes(views.cameras))
         figures = _views(views)
     system = source.map_system
-    figures |= {} if system is None else {"map_system": system}
+    if system is not None:
+        figures["map_system"] = system
     if source.kind == "points":
         figures["metres_per_unit"] = source.metres_per_unit
     return {
@@ -62,7 +65,7 @@ def describe(given: str | Path | ViewFiles, more: Callable[[Splats], Json] | Non
         "format": source.format,
         "bytes": bytes_of(path),
         **figures,
-        "notes": [{"code": n.code, "count": n.count, "text": n.text} for n in notes],
+        "notes": [asdict(note) for note in notes],
     }
 
 
@@ -72,7 +75,10 @@ def bytes_of(path: Path) -> int:
     folders = chunks_of(path) or [path]
     files = list[Path]()
     for folder in folders:
-        files += folder.rglob("*") if folder.is_dir() else [folder]
+        if folder.is_dir():
+            files += folder.rglob("*")
+        else:
+            files.append(folder)
     return sum(file.stat().st_size for file in files if file.is_file())
 
 
@@ -125,16 +131,16 @@ def _points(points: Points) -> Json:
 
 def _views(views: ViewSet) -> Json:
     cameras = views.cameras
-    sizes = Counter(f"{w}×{h}" for w, h in zip(cameras.widths, cameras.heights, strict=True))
+    pixels = zip(cameras.widths, cameras.heights, strict=True)
+    sizes = Counter(f"{width}×{height}" for width, height in pixels)
+    across = 2 * np.arctan(cameras.widths / (2 * cameras.Ks[:, 0, 0]))
     return {
         "count": len(cameras),
         "photos": sum(path is not None for path in cameras.image_paths),
         "sizes": dict(sizes.most_common()),
-        "fov_degrees": _quantiles(
-            np.degrees(2 * np.arctan(cameras.widths / (2 * cameras.Ks[:, 0, 0])))
-        ),
+        "fov_degrees": _quantiles(np.degrees(across)),
         "distorted": int(cameras.distortions.any(1).sum()),
-        "splits": dict(Counter(s for s in views.splits if s)),
+        "splits": dict(Counter(filter(None, views.splits))),
         "extent": _extent(cameras.positions),
     }
 
@@ -150,7 +156,9 @@ def _photo_notes(cameras: Cameras) -> list[Note]:
         text = f"the photos have a constant border colour: {colour_text(traits.border)} (see --background)"
         notes.append(Note("constant_border", len(photos), text))
     if len(traits.sizes) > 1:
-        (width, height), most = max(traits.sizes.items(), key=lambda item: item[1])
+        size = max(traits.sizes, key=traits.sizes.__getitem__)
+        width, height = size
+        most = traits.sizes[size]
         others = sum(traits.sizes.values()) - most
         text = f"{plural(most, 'photo')} of {width}×{height} pixels, {others} of other sizes"
         notes.append(Note("mixed_sizes", others, text))

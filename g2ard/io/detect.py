@@ -62,7 +62,9 @@ _FOLDERS: dict[str, tuple[str, ...] | None] = {
     "nerfstudio_export": None,
     "transforms": (
         "transforms.json",
-        *(f"transforms_{split}.json" for split in ("train", "val", "test")),
+        "transforms_train.json",
+        "transforms_val.json",
+        "transforms_test.json",
     ),
     "llff": ("poses_bounds.npy",),
     "polycam": None,
@@ -174,7 +176,10 @@ def reader(path: Path, name: str, expected: Kind) -> Any:
                 import_module(f"g2ard.io.{name}").read(path)
         if name == "cloud_ply" and plyfiles.is_mesh(plyfiles.read_header(path)):
             raise InputError("is a mesh", path=path, hint=MESH)
-        what = _NAMES[found] if found != "views" else name
+        if found != "views":
+            what = _NAMES[found]
+        else:
+            what = name
         hint = _OTHER_KINDS.get((expected, found))
         raise InputError(f"expected {_NAMES[expected]}, found {what}", path=path, hint=hint)
     return import_module(f"g2ard.io.{MODULES.get(name, name)}")
@@ -186,10 +191,11 @@ def _of_file(path: Path, modified: int, size: int) -> str:
     suffix = path.suffix.lower()
     _check_content(path)
     if path.name.lower() == "meta.json":
-        _by_gsplat(path.parent)
+        _reject_gsplat(path.parent)
     if suffix == ".ply":
         return _ply_format(path)
-    if found := _BY_NAME.get(path.name.lower()) or _BY_NAME.get(suffix):
+    found = _BY_NAME.get(path.name.lower()) or _BY_NAME.get(suffix)
+    if found:
         return found
     if suffix == ".json":
         return _json_format(path)
@@ -216,8 +222,10 @@ def _check_content(path: Path) -> None:
         return
     if not sign.reads:
         raise sign.error(path)
+    if sign.reads == suffix:
+        return
     named = _BY_NAME.get(suffix)
-    fits = sign.reads == suffix or (named in _PACKED and named == _BY_NAME.get(sign.reads))
+    fits = named in _PACKED and named == _BY_NAME.get(sign.reads)
     is_count = suffix == ".bin" and path.name.lower() in _BY_NAME  # COLMAP's first bytes are any
     if not fits and not is_count:
         hint = f"rename it to {path.stem}{sign.reads}"
@@ -281,10 +289,11 @@ def json_format(content: Any) -> str | None:
     sample = content
     if isinstance(content, list):
         sample = next(iter(content), None)
-    fields = sample if isinstance(sample, dict) else {}
-    keys = set(fields)
-    if "format" not in keys and not isinstance(fields.get("views"), list):
-        keys.discard("views")  # a number of views, say
+    keys = set[str]()
+    if isinstance(sample, dict):
+        keys.update(sample)
+        if "format" not in keys and not isinstance(sample.get("views"), list):
+            keys.discard("views")  # a number of views, say
     for name, (own, needed) in _JSON.items():
         if isinstance(content, own) and needed <= keys:
             return name
@@ -309,7 +318,9 @@ def find_views(scene: AnyPath) -> Path | None:
         A file, or a folder of lists; relative if `scene` is.
     """
     scene = Path(scene)
-    own = (scene if scene.is_dir() else scene.parent).absolute()
+    own = scene.absolute()
+    if not own.is_dir():
+        own = own.parent
     found = next(_cameras_of(own), None)
     if found is None or scene.is_absolute():
         return found
@@ -356,15 +367,20 @@ def _folder_format(path: Path) -> str:
 
     if (path / MANIFEST).is_file():
         return "tiles"
-    if (chunks := chunks_of(path)) and not (chunks[0].is_dir() and _by_gsplat(chunks[0])):
+    chunks = chunks_of(path)
+    if chunks:
+        if chunks[0].is_dir():
+            _reject_gsplat(chunks[0])
         return "sog"
-    if name := next((name for name in _FOLDERS if holds(name, path)), None):
-        return name
+    for name in _FOLDERS:
+        if holds(name, path):
+            return name
     if (path / "tileset.json").is_file():
         return file_format(path / "tileset.json")
     if any(path.glob("tile-*.f32")) or (path / PARTS).is_dir():
         raise InputError("has unfinished tiles", hint="run the same `g2ard ingest` again")
-    if error := incomplete(path):
+    error = incomplete(path)
+    if error:
         raise error
     if _holds_clouds(path):
         return "clouds"
@@ -386,29 +402,32 @@ def _holds_clouds(folder: Path) -> bool:
     return bool(clouds) and all(kind(file) == "points" for file in islice(clouds, 4))
 
 
-def _by_gsplat(folder: Path) -> bool:
+def _reject_gsplat(folder: Path) -> None:
     """Raise an error if a meta.json is that of gsplat's PNGs, which lists no files."""
     from g2ard.io.jsonfile import read_any_json
 
     content = read_any_json(folder / "meta.json")
-    means = content.get("means") if isinstance(content, dict) else None
-    if not isinstance(means, dict) or "files" in means or "shape" not in means:
-        return False
-    raise InputError(
-        "holds PNG images of gsplat's compression, not SOG",
-        path=folder,
-        hint="export the scene as .ply with gsplat's `export_splats`",
-    )
+    means = None
+    if isinstance(content, dict):
+        means = content.get("means")
+    if isinstance(means, dict) and "shape" in means and "files" not in means:
+        raise InputError(
+            "holds PNG images of gsplat's compression, not SOG",
+            path=folder,
+            hint="export the scene as .ply with gsplat's `export_splats`",
+        )
 
 
 def _near(path: Path) -> str:
     """Suggest similar names in the parent folder, or say that it is missing."""
     if not path.parent.is_dir():
         return f", nor a folder {path.parent}"
-    close = get_close_matches(path.name, [file.name for file in path.parent.iterdir()], 2)
+    names = [file.name for file in path.parent.iterdir()]
+    close = get_close_matches(path.name, names, 2)
     if not close:
         return ""
-    return f"; did you mean {' or '.join(str(path.with_name(name)) for name in close)}?"
+    meant = " or ".join(str(path.with_name(name)) for name in close)
+    return f"; did you mean {meant}?"
 
 
 _NO_FOLDER = "is not a supported folder"
@@ -419,7 +438,11 @@ def _unsupported(path: Path) -> str:
     from g2ard.io.colmap import models_below
     from g2ard.io.photo_headers import describe_unreadable
 
-    held: dict[Kind, list[str]] = {"splats": [], "points": [], "views": []}
+    held: dict[Kind, list[str]] = {
+        "splats": [],
+        "points": [],
+        "views": [],
+    }
     files = (
         file
         for file in sorted(path.iterdir())
@@ -428,29 +451,39 @@ def _unsupported(path: Path) -> str:
     for file in islice(files, _MOST_INSPECTED_FILES):
         with suppress(InputError):
             held[kind(file)].append(file.name)
-    words = {"splats": "a scene", "points": "a point cloud", "views": "views"}
-    held_kinds = [
-        f"{', '.join(names[:5])} ({words[what]})" for what, names in held.items() if names
-    ]
+    words = {
+        "splats": "a scene",
+        "points": "a point cloud",
+        "views": "views",
+    }
+    held_kinds = []
+    for what, names in held.items():
+        if names:
+            held_kinds.append(f"{', '.join(names[:5])} ({words[what]})")
     if held_kinds:
         return f"{_NO_FOLDER}; give one of its files: {', '.join(held_kinds)}"
-    if runs := [folder.name for folder in sorted(path.iterdir()) if run_scene(folder) != folder]:
+    runs = [folder.name for folder in sorted(path.iterdir()) if run_scene(folder) != folder]
+    if runs:
         return f"{_NO_FOLDER}; give one of its runs: {', '.join(runs[:5])}"
-    if models := models_below(path):
+    models = models_below(path)
+    if models:
         return f"{_NO_FOLDER}; give {models[0]}, which has a COLMAP model"
-    if found := _foreign_in(path):
+    found = _foreign_in(path)
+    if found:
         file, sign = found
         return f"{_NO_FOLDER}; {file.relative_to(path)} is {sign.what}: {sign.todo}"
     for place in (path / "images", path):
         photos = _photos_in(place)
         if not photos:
             continue
-        if (poses := _poses_above(path)) is not None:
+        poses = _poses_above(path)
+        if poses is not None:
             return f"holds photos alone; give {poses}, which has their poses"
-        unread = [
-            what for file in photos[:_MOST_INSPECTED_FILES] if (what := describe_unreadable(file))
-        ]
-        first = f"convert its {unread[0]} photos to JPEG, then " if unread else ""
+        first = ""
+        formats = map(describe_unreadable, photos[:_MOST_INSPECTED_FILES])
+        unread = next(filter(None, formats), None)
+        if unread:
+            first = f"convert its {unread} photos to JPEG, then "
         return (
             f"holds photos without poses: {first}estimate them with `colmap automatic_reconstructor "
             f"--workspace_path project --image_path {place}` and give project"
@@ -521,7 +554,8 @@ def _json_format(path: Path) -> str:
     from g2ard.io.jsonfile import read_any_json
 
     content = read_any_json(path)
-    if name := json_format(content):
+    name = json_format(content)
+    if name:
         return name
     if not isinstance(content, dict):
         raise InputError(

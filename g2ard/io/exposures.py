@@ -23,17 +23,23 @@ def find_exposures(cameras: Cameras) -> dict[str, Float]:
             continue
         path = exposure_file(photo)
         if path not in tables:
-            content = read_json(path) if path.is_file() else {}
-            tables[path] = {
-                key: np.array(checked(rows, tuple[Row, Row, Row], Place(path).to(key)))
-                for key, rows in content.items()
-            }
+            tables[path] = _read_table(path)
         table = tables[path]
         for key in (name, photo.name, photo.stem):
             if key in table:
                 exposures[name] = table[key]
                 break
     return exposures
+
+
+def _read_table(path: Path) -> dict[str, Float]:
+    if not path.is_file():
+        return {}
+    content = read_json(path)
+    for key, rows in content.items():
+        matrix = checked(rows, tuple[Row, Row, Row], Place(path).to(key))
+        content[key] = np.array(matrix)
+    return content
 
 
 def exposure_file(photo: Path) -> Path:

@@ -19,8 +19,11 @@ _PHOTO_SUFFIXES = tuple(_READ.split())
 
 _RAW = ".dng .cr2 .cr3 .nef .arw .raf .orf .rw2 .raw"
 _OTHER_PHOTOS = {
-    **dict.fromkeys((".heic", ".heif", ".hif"), "HEIC"),
-    **dict.fromkeys((".avif", ".avifs"), "AVIF"),
+    ".heic": "HEIC",
+    ".heif": "HEIC",
+    ".hif": "HEIC",
+    ".avif": "AVIF",
+    ".avifs": "AVIF",
     ".exr": "OpenEXR",
     ".hdr": "Radiance HDR",
     ".jxl": "JPEG XL",
@@ -39,8 +42,14 @@ _MASK_FOLDERS = ("masks", "mask")
 MOVING = "dynamic_mask_"
 """Prefix of instant-ngp's masks, in which white marks what moves."""
 _MASKS_BESIDE = (
-    *("{name}.mask", "{stem}.mask", "{name}_mask", "{stem}_mask", "{stem}-mask", "mask_{stem}"),
-    *(MOVING + "{stem}", MOVING + "{name}"),
+    "{name}.mask",
+    "{stem}.mask",
+    "{name}_mask",
+    "{stem}_mask",
+    "{stem}-mask",
+    "mask_{stem}",
+    MOVING + "{stem}",
+    MOVING + "{name}",
 )
 _MASKS = ("{name}", "{stem}", *_MASKS_BESIDE)
 """Names of a photo's mask without its suffix: beside the photo, and in a folder of masks."""
@@ -96,8 +105,10 @@ class Finder:
         if any(map(expected.find, asked)):
             return expected
         roots = [root for root in dict.fromkeys(around) if root.is_dir()]
-        inner = (sorted(filter(Path.is_dir, root.iterdir()))[:_MOST_FOLDERS] for root in roots)
-        for place in [*roots, *(folder for folders in inner for folder in folders)]:
+        places = list(roots)
+        for root in roots:
+            places += sorted(filter(Path.is_dir, root.iterdir()))[:_MOST_FOLDERS]
+        for place in places:
             found = cls(place)
             there = sum(found.find(name) is not None for name in asked)
             if 2 * there >= max(1, len(asked)):
@@ -113,11 +124,15 @@ class Finder:
             if usable(folder / name):
                 return folder / name
         parts = plain_parts(name)
+        if not parts:
+            return None
         ends = [parts[k:] for k in range(len(parts))]
-        for keys in _keys(parts[-1] if parts else ""):
+        for keys in _keys(parts[-1]):
             for end in ends:
                 for folder in self._folders:
-                    if found := _first(self._within(folder, end[:-1]), keys):
+                    files = self._within(folder, end[:-1])
+                    found = _first(files, keys)
+                    if found:
                         return found
         return None
 
@@ -128,12 +143,17 @@ class Finder:
     def mask(self, photo: Path, depth: int) -> Path | None:
         """Return the mask of a photo: in a folder of masks beside that of the photos, at most `depth` folders
         above, with the same folders in it; otherwise beside the photo."""
-        spelled = [(place, path, _MASKS) for place, path in mask_folders(photo, depth)]
-        for folder, path, names in [*spelled, (photo.parent, Path(photo.name), _MASKS_BESIDE)]:
+        places: list[tuple[Path, Path, Sequence[str]]] = []
+        for folder, path in mask_folders(photo, depth):
+            places.append((folder, path, _MASKS))
+        places.append((photo.parent, Path(photo.name), _MASKS_BESIDE))
+        for folder, path, names in places:
             keys = [f"stem {_folded(name)}" for name in _mask_names(path, names)]
             if names is _MASKS:
                 keys.insert(0, f"exact {path.name}")
-            if found := _first(self._within(folder, path.parts[:-1]), keys):
+            files = self._within(folder, path.parts[:-1])
+            found = _first(files, keys)
+            if found:
                 return found
         return None
 
@@ -149,22 +169,24 @@ class Finder:
 
     def _listed(self, folder: Path) -> tuple[dict[str, Path], dict[str, Path]]:
         """Return the files and the folders of a folder by key; only photos have keys without suffix."""
-        if folder not in self._listings:
-            held = []
-            if folder.is_dir():
-                held = sorted(folder.iterdir(), reverse=True)
-            held.sort(key=is_photo)  # those that can be read win over others of the same stem
-            levels = [(path, _keys(path.name)) for path in held if usable(path)]
-            files: dict[str, Path] = {}
-            for depth in (3, 2, 1, 0):  # nearer spellings win
-                for path, keys in levels:
-                    if depth < 2 or is_a_photo(path):
-                        files |= dict.fromkeys(keys[depth], path)
-            inner: dict[str, Path] = {}
-            for path in filter(Path.is_dir, held):
-                inner |= dict.fromkeys(chain.from_iterable(_keys(path.name)), path)
-            self._listings[folder] = files, inner
-        return self._listings[folder]
+        if folder in self._listings:
+            return self._listings[folder]
+        held = []
+        if folder.is_dir():
+            held = sorted(folder.iterdir(), reverse=True)
+        held.sort(key=is_photo)  # those that can be read win over others of the same stem
+        levels = [(path, _keys(path.name)) for path in held if usable(path)]
+        files: dict[str, Path] = {}
+        for depth in (3, 2, 1, 0):  # nearer spellings win
+            for path, keys in levels:
+                if depth < 2 or is_a_photo(path):
+                    files |= dict.fromkeys(keys[depth], path)
+        inner: dict[str, Path] = {}
+        for path in filter(Path.is_dir, held):
+            for names in _keys(path.name):
+                inner |= dict.fromkeys(names, path)
+        self._listings[folder] = files, inner
+        return files, inner
 
 
 def _first(files: Mapping[str, Path], keys: Iterable[str]) -> Path | None:
@@ -178,10 +200,12 @@ def _mask_names(photo: Path, patterns: Sequence[str]) -> list[str]:
 
 def _keys(name: str) -> list[list[str]]:
     """Return what a file may be found by, the strictest first."""
-    folded = _folded(name)
-    stem = f"stem {_folded(_stem(name))}"
-    others = [f"other {_folded(_stem(other))}" for other in _respelled(name)]
-    return [[f"exact {name}"], [f"name {folded}"], [stem], others]
+    return [
+        [f"exact {name}"],
+        [f"name {_folded(name)}"],
+        [f"stem {_folded(_stem(name))}"],
+        [f"other {_folded(_stem(other))}" for other in _respelled(name)],
+    ]
 
 
 def _stem(name: str) -> str:
@@ -196,7 +220,8 @@ def _folded(name: str) -> str:
     >>> _folded("Ku\\u0308che") == _folded("K\\u00dcCHE")
     True
     """
-    return unicodedata.normalize("NFC", unicodedata.normalize("NFC", name).casefold())
+    folded = unicodedata.normalize("NFC", name).casefold()
+    return unicodedata.normalize("NFC", folded)
 
 
 def _respelled(name: str) -> Iterator[str]:
@@ -210,8 +235,11 @@ def _respelled(name: str) -> Iterator[str]:
     if name.isascii():
         return
     for wrong in ("utf-8", *_MISREAD_AS):
+        errors = "strict"
+        if wrong == "utf-8":
+            errors = "surrogateescape"
         with suppress(UnicodeError):
-            data = name.encode(wrong, "surrogateescape" if wrong == "utf-8" else "strict")
+            data = name.encode(wrong, errors)
             for own in ("utf-8", *_CODE_PAGES):
                 with suppress(UnicodeError):
                     yield data.decode(own)
@@ -256,7 +284,9 @@ def usable(path: Path) -> bool:
 
 def files_in(folder: Path, *suffixes: str) -> list[Path]:
     """Return the usable files of a folder, sorted; none if it does not exist."""
-    held = sorted(folder.iterdir()) if folder.is_dir() else []
+    if not folder.is_dir():
+        return []
+    held = sorted(folder.iterdir())
     if suffixes:
         held = [path for path in held if path.suffix.lower() in suffixes]
     return list(filter(usable, held))
@@ -269,9 +299,9 @@ def photos_in(folder: Path, *, below: bool = False) -> list[Path]:
     else:
         files = files_in(folder)
     photos = [file for file in files if is_photo(file)]
-    masks = {
-        photo.with_name(name) for photo in photos for name in _mask_names(photo, _MASKS_BESIDE)
-    }
+    masks = set[Path]()
+    for photo in photos:
+        masks.update(map(photo.with_name, _mask_names(photo, _MASKS_BESIDE)))
     return [photo for photo in photos if photo.with_name(photo.stem) not in masks]
 
 
@@ -302,13 +332,16 @@ def plain_parts(name: str) -> list[str]:
 def is_end(name: str, photo: Path) -> bool:
     """Return whether a photo's path ends in all parts of `name`, whatever the spelling and suffix."""
     parts = plain_parts(name)
-    own = photo.parts[len(photo.parts) - len(parts) :]
-    return len(parts) <= len(photo.parts) and all(map(_are_alike, parts, own))
+    skipped = len(photo.parts) - len(parts)
+    if skipped < 0:
+        return False
+    return all(map(_are_alike, parts, photo.parts[skipped:]))
 
 
 def _are_alike(name: str, other: str) -> bool:
     """Return whether two names may be of one file."""
-    return any(not set(a).isdisjoint(b) for a, b in zip(_keys(name), _keys(other), strict=True))
+    levels = zip(_keys(name), _keys(other), strict=True)
+    return any(not set(own).isdisjoint(others) for own, others in levels)
 
 
 def mask_folders(photo: Path, depth: int) -> list[tuple[Path, Path]]:
@@ -322,8 +355,10 @@ def mask_folders(photo: Path, depth: int) -> list[tuple[Path, Path]]:
         if not own.is_dir():
             continue
         names = [f"{name}_{size}" for name in _MASK_FOLDERS if size]
-        names += [*_MASK_FOLDERS, *(f"{own.name}_{name}" for name in _MASK_FOLDERS)]
-        beside = {_folded(p.name): p for p in own.parent.iterdir() if p.is_dir()}
+        names += _MASK_FOLDERS
+        names += [f"{own.name}_{name}" for name in _MASK_FOLDERS]
+        beside = {_folded(path.name): path for path in own.parent.iterdir() if path.is_dir()}
+        path = photo.relative_to(own)
         folders = [beside[key] for key in map(_folded, names) if key in beside]
-        found += [(folder, photo.relative_to(own)) for folder in folders]
+        found += [(folder, path) for folder in folders]
     return found

@@ -132,10 +132,9 @@ def _fit_lens_to_photo(lens: Lens, photo: Path) -> tuple[Lens, bool]:
     A photo that cannot be read changes nothing.
     """
     with suppress(Exception), open_image(photo) as image:
+        size = image.size
         if needs_turn(image, lens.size):
-            size = swap_sides(image.size)
-        else:
-            size = image.size
+            size = swap_sides(size)
         is_turned = orientation(image) != 1
         if not lens.made and have_same_aspect(size, lens.size):
             lens = lens.at(size)
@@ -153,7 +152,8 @@ def make_rigid(matrix: Float, place: Place) -> Float:
     U, scales, Vt = np.linalg.svd(matrix[:3, :3])
     largest, _, least = scales
     R = U @ Vt
-    if not largest > 0 or least < 0.99 * largest or np.linalg.det(R) < 0:
+    is_mirrored = np.linalg.det(R) < 0
+    if not largest > 0 or least < 0.99 * largest or is_mirrored:
         raise place.error("is not a rotation and a translation")
     out = np.eye(4)
     out[:3, :3] = R
@@ -183,8 +183,18 @@ def _stack_cameras(path: Path, frames: Sequence[Frame]) -> Cameras:
     rows = []
     for frame in frames:
         lens = frame.lens
-        row = frame.viewmat, lens.K, lens.size, frame.name, frame.photo, lens.distortion
-        rows.append((*row, _find_mask(frame, masks), frame.kind, lens.photo))
+        row = (
+            frame.viewmat,
+            lens.K,
+            lens.size,
+            frame.name,
+            frame.photo,
+            lens.distortion,
+            _find_mask(frame, masks),
+            frame.kind,
+            lens.photo,
+        )
+        rows.append(row)
     try:
         return Cameras.from_lists(*zip(*rows, strict=True))
     except InputError as error:
@@ -197,7 +207,8 @@ def _find_mask(frame: Frame, masks: Finder) -> Path | None:
     """Return the frame's mask, or that found for its photo."""
     if frame.mask is not None or frame.photo is None:
         return frame.mask
-    return masks.mask(frame.photo, len(plain_parts(frame.listed or frame.name)))
+    depth = len(plain_parts(frame.listed or frame.name))
+    return masks.mask(frame.photo, depth)
 
 
 def make_view_set(listed: Listed) -> ViewSet:
@@ -213,45 +224,65 @@ def make_view_set(listed: Listed) -> ViewSet:
     notes = []
     if left_out:
         name, fault = left_out[0]
-        text = f"{plural(len(left_out), 'view')} left out, which numbers that are not finite describe: {fault}"
-        notes.append(Note("not_finite", len(left_out), f"{text} (view {name!r})"))
+        views = plural(len(left_out), "view")
+        text = (
+            f"{views} left out, which numbers that are not finite describe: {fault} (view {name!r})"
+        )
+        notes.append(Note("not_finite", len(left_out), text))
     frames, found_notes = _check_photos(frames)
     notes += found_notes
-    bent = [frame for frame in frames if frame.lens.is_bent]
+    bent = [frame.lens.photo for frame in frames if frame.lens.is_bent]
     if bent:
         frames = [view for frame in frames for view in _split_into_pinholes(frame)]
-        models = ", ".join(sorted({frame.lens.photo.model for frame in bent if frame.lens.photo}))
         made = sum(frame.lens.photo is not None for frame in frames)
-        text = (
-            f"{plural(len(bent), 'photo')} ({models}) resampled to {plural(made, 'pinhole view')}"
-        )
+        models = ", ".join(sorted({lens.model for lens in bent if lens}))
+        photos = plural(len(bent), "photo")
+        text = f"{photos} ({models}) resampled to {plural(made, 'pinhole view')}"
         notes.append(Note("resampled", made, text))
-    pictured = [frame for frame in frames if frame.photo is not None]
-    present = [frame for frame in pictured if frame.photo and usable(frame.photo)]
+    pictured = [frame.photo for frame in frames if frame.photo is not None]
+    present = [frame for frame in frames if frame.photo is not None and usable(frame.photo)]
     if present and len(present) < len(frames):
         there = {frame.name for frame in present}
-        frames = [f if f.name in there else f._replace(photo=None, mask=None) for f in frames]
+        for i, frame in enumerate(frames):
+            if frame.name not in there:
+                frames[i] = frame._replace(photo=None, mask=None)
     elif not present and pictured:
-        text = f"none of {plural(len(pictured), 'photo')} found; using poses only"
-        notes.append(Note("no_photos", len(pictured), f"{text} (the first is {pictured[0].photo})"))
+        photos = plural(len(pictured), "photo")
+        text = f"none of {photos} found; using poses only (the first is {pictured[0]})"
+        notes.append(Note("no_photos", len(pictured), text))
         frames = [frame._replace(photo=None) for frame in frames]
     cameras = replace(_stack_cameras(path, frames), source=path)
     masked = sum(mask is not None for mask in cameras.mask_paths)
     if masked:
-        notes.append(
-            Note("masks", masked, f"{plural(masked, 'photo')} of {len(present)} have masks")
-        )
-    elif present and (folders := _find_idle_masks(present)):
-        text = f"no mask in {folders[0]} is named like a photo, as {present[0].name}.png would be"
-        notes.append(Note("unused_masks", 1, text))
-    splits = tuple(f.split for f in frames)
-    weights = [f.weight for f in frames]
+        text = f"{plural(masked, 'photo')} of {len(present)} have masks"
+        notes.append(Note("masks", masked, text))
+    elif present:
+        folders = _find_idle_masks(present[0])
+        if folders:
+            name = present[0].name
+            text = f"no mask in {folders[0]} is named like a photo, as {name}.png would be"
+            notes.append(Note("unused_masks", 1, text))
     return ViewSet(
         cameras,
         (*notes, *further),
-        splits if any(splits) else (),
-        None if set(weights) == {None} else np.array([1.0 if w is None else w for w in weights]),
+        _list_splits(frames),
+        _list_weights(frames),
     )
+
+
+def _list_splits(frames: Sequence[Frame]) -> tuple[str | None, ...]:
+    splits = tuple(frame.split for frame in frames)
+    if any(splits):
+        return splits
+    return ()
+
+
+def _list_weights(frames: Sequence[Frame]) -> Float | None:
+    """Return the weights of views, 1 where none is stated; None if none is."""
+    weights = [frame.weight for frame in frames]
+    if set(weights) == {None}:
+        return None
+    return np.array([1.0 if weight is None else weight for weight in weights])
 
 
 def _split_into_pinholes(frame: Frame) -> list[Frame]:
@@ -264,17 +295,20 @@ def _split_into_pinholes(frame: Frame) -> list[Frame]:
     for face, turn, K, size in lens.faces(scale):
         viewmat = np.eye(4)
         viewmat[:3] = turn.T @ frame.viewmat[:3]
-        name = f"{frame.name}#{face}" if face else frame.name
+        name = frame.name
+        if face:
+            name += f"#{face}"
         own = Lens(size, K, photo=lens.turned(turn), made=True)
         views.append(frame._replace(name=name, viewmat=viewmat, lens=own))
     return views
 
 
-def _find_idle_masks(present: Sequence[Frame]) -> list[Path]:
-    """Return folders of masks for the first photo that hold images."""
-    photo = present[0].photo
-    name = present[0].listed or present[0].name
-    folders = mask_folders(photo, len(plain_parts(name))) if photo else []
+def _find_idle_masks(frame: Frame) -> list[Path]:
+    """Return folders of masks for a photo that hold images."""
+    if frame.photo is None:
+        return []
+    depth = len(plain_parts(frame.listed or frame.name))
+    folders = mask_folders(frame.photo, depth)
     return [folder for folder, _ in folders if photos_in(folder, below=True)]
 
 
@@ -297,32 +331,36 @@ def _check_photos(frames: Sequence[Frame]) -> tuple[list[Frame], list[Note]]:
     times = Counter(frame.photo for frame in frames)
     for i, frame in enumerate(frames):
         photo = frame.photo
-        wanted = Path(frame.listed)
         if photo is None or not usable(photo):
             continue
-        if (what := describe_unreadable(photo)) is not None:
+        what = describe_unreadable(photo)
+        if what is not None:
             found["unreadable_photos"].append(f"{frame.name} is {what}")
             out[i] = frame._replace(photo=None, mask=None)
-        elif frame.listed and times[photo] > 1 and not is_end(frame.listed, photo):
+            continue
+        if frame.listed and times[photo] > 1 and not is_end(frame.listed, photo):
             found["equal_names"].append(f"{frame.name} is not {photo}, which another view has")
             out[i] = frame._replace(photo=None, mask=None)
-        else:
-            if is_a_photo(wanted) and photo.suffix.lower() != wanted.suffix.lower():
+            continue
+        wanted = Path(frame.listed)
+        if is_a_photo(wanted):
+            if photo.suffix.lower() != wanted.suffix.lower():
                 found["other_suffix"].append(f"{frame.name} is {photo.name}")
-            elif is_a_photo(wanted) and plain_parts(frame.listed)[-1].lower() != photo.name.lower():
+            elif plain_parts(frame.listed)[-1].lower() != photo.name.lower():
                 found["other_spelling"].append(f"{frame.name} is {photo.name}")
-            lens, is_turned = _fit_lens_to_photo(frame.lens, photo)
-            if is_turned:
-                found["exif_orientation"].append(photo.name)
-            if lens.size != frame.lens.size:
-                sizes = "{}×{} instead of {}×{}".format(*lens.size, *frame.lens.size)
-                found["other_size"].append(f"{frame.name} is {sizes}")
-                out[i] = frame._replace(lens=lens)
+        lens, is_turned = _fit_lens_to_photo(frame.lens, photo)
+        if is_turned:
+            found["exif_orientation"].append(photo.name)
+        if lens.size != frame.lens.size:
+            sizes = "{}×{} instead of {}×{}".format(*lens.size, *frame.lens.size)
+            found["other_size"].append(f"{frame.name} is {sizes}")
+            out[i] = frame._replace(lens=lens)
     notes = []
     for code, photos in found.items():
         if photos:
             text = _PHOTO_NOTES[code].format(first=photos[0], views=len(frames))
-            notes.append(Note(code, len(photos), f"{plural(len(photos), 'photo')} {text}"))
+            text = f"{plural(len(photos), 'photo')} {text}"
+            notes.append(Note(code, len(photos), text))
     return out, notes
 
 
@@ -340,13 +378,12 @@ def drop_unpictured(found: ViewSet) -> ViewSet:
 def use_alpha_as_masks(found: ViewSet) -> ViewSet:
     """Make each photo with alpha and without a mask its own mask, and note how many."""
     cameras = found.cameras
-    own = [
-        mask is None and photo is not None and has_alpha(photo)
-        for photo, mask in zip(cameras.image_paths, cameras.mask_paths, strict=True)
-    ]
-    pairs = zip(own, cameras.image_paths, cameras.mask_paths, strict=True)
-    masks = tuple(photo if use else mask for use, photo, mask in pairs)
-    text = f"{plural(sum(own), 'photo')} of {len(own)} masked by alpha"
-    return replace(found, cameras=replace(cameras, mask_paths=masks)).noted(
-        "alpha_masks", sum(own), text
-    )
+    masks = list(cameras.mask_paths)
+    count = 0
+    for i, photo in enumerate(cameras.image_paths):
+        if masks[i] is None and photo is not None and has_alpha(photo):
+            masks[i] = photo
+            count += 1
+    found = replace(found, cameras=replace(cameras, mask_paths=tuple(masks)))
+    text = f"{plural(count, 'photo')} of {len(masks)} masked by alpha"
+    return found.noted("alpha_masks", count, text)

@@ -59,7 +59,12 @@ def read(given: ViewFiles) -> Listed:
     return Listed(path, frames)
 
 
-def _frame(place: Place, view: _View, finder: Finder, masks: Finder) -> Frame:
+def _frame(
+    place: Place,
+    view: _View,
+    finder: Finder,
+    masks: Finder,
+) -> Frame:
     distortion = *view.distortion, *[0.0] * 5
     return Frame(
         name=view.name,
@@ -101,38 +106,51 @@ def _written(lens: PhotoLens | None) -> Json | None:
     if lens is None:
         return None
     turn = np.array(lens.turn).reshape(3, 3).tolist()
-    return {"model": lens.model, "size": lens.size, "params": lens.params, "turn": turn}
+    return {
+        "model": lens.model,
+        "size": lens.size,
+        "params": lens.params,
+        "turn": turn,
+    }
 
 
-def text_of(path: Path, cameras: Cameras, splits: Splits, weights: ArrayLike | None) -> str:
+def text_of(
+    path: Path,
+    cameras: Cameras,
+    splits: Splits,
+    weights: ArrayLike | None,
+) -> str:
     """Return views, one per line, with exact floats; see `g2ard.io.write_views`."""
     count = len(cameras)
-    if weights is None:
-        given = np.full(count, np.nan)
-    else:
-        given = np.asarray(weights, float)
-    drawn = [None if np.isnan(weight) else weight for weight in given.tolist()]
+    drawn = [None] * count
+    if weights is not None:
+        given = np.asarray(weights, float).tolist()
+        drawn = [None if np.isnan(weight) else weight for weight in given]
     parts = list(splits) or [None] * count
     if len(parts) != count or len(drawn) != count:
-        raise InputError(
-            f"{plural(count, 'view')}, {len(parts)} splits and {len(drawn)} weights do not match",
-            path=path,
-        )
+        counts = f"{plural(count, 'view')}, {len(parts)} splits and {len(drawn)} weights"
+        raise InputError(f"{counts} do not match", path=path)
     lines = []
     for i in range(count):
+        kind = None
+        if cameras.kinds[i] != USUAL:
+            kind = cameras.kinds[i]
+        distortion = None
+        if cameras.distortions[i].any():
+            distortion = cameras.distortions[i].tolist()
         view: Json = {
             "name": cameras.names[i],
             "width": int(cameras.widths[i]),
             "height": int(cameras.heights[i]),
             "K": cameras.Ks[i].tolist(),
             "camera_from_world": cameras.viewmats[i].tolist(),
-            "distortion": cameras.distortions[i].tolist() if cameras.distortions[i].any() else None,
+            "distortion": distortion,
             "lens": _written(cameras.lenses[i]),
             "image": beside(cameras.image_paths[i], path),
             "mask": beside(cameras.mask_paths[i], path),
             "split": parts[i],
             "weight": drawn[i],
-            "kind": None if cameras.kinds[i] == USUAL else cameras.kinds[i],
+            "kind": kind,
         }
         stated = {key: value for key, value in view.items() if value is not None}
         lines.append(json.dumps(stated))

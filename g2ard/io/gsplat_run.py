@@ -35,10 +35,10 @@ def read(views: ViewFiles) -> Listed:
     """
     file = views.file(NAME)
     settings = read_settings(file)
-    if settings.word("data_type") not in (None, "colmap"):
-        raise InputError(
-            f"unsupported data_type {settings.word('data_type')!r}; expected 'colmap'", path=file
-        )
+    kind = settings.word("data_type")
+    if kind not in (None, "colmap"):
+        text = f"unsupported data_type {kind!r}; expected 'colmap'"
+        raise InputError(text, path=file)
     if settings.word("normalize_world_space") != "false":
         raise InputError(
             "was trained in a normalised world, and the run does not store the transform",
@@ -49,11 +49,12 @@ def read(views: ViewFiles) -> Listed:
     data = data_of(file)
     if named is None or data is None:
         text = f"data_dir {named and named.as_posix()} does not exist"
-        raise InputError(
-            text, path=file, hint="give its COLMAP folder as views, or correct data_dir"
-        )
+        hint = "give its COLMAP folder as views, or correct data_dir"
+        raise InputError(text, path=file, hint=hint)
+    photos = views.images
     smaller = data / f"images_{settings.word('data_factor')}"
-    photos = views.images or (smaller if smaller.is_dir() else None)
+    if not photos and smaller.is_dir():
+        photos = smaller
     try:
         found = colmap.listed(ViewFiles(data, photos))
         frames = found.whole()
@@ -61,14 +62,13 @@ def read(views: ViewFiles) -> Listed:
         raise InputError(f"data_dir: {error}", path=file) from error
     every = settings.word("test_every") or "8"
     if not every.isdigit() or int(every) < 1:
-        raise InputError(
-            f"is {every!r}, expected a whole number ≥ 1", path=file, property="test_every"
-        )
-    frames = [
-        frame._replace(split="train" if i % int(every) else "test")
-        for i, frame in enumerate(frames)
-    ]
+        text = f"is {every!r}, expected a whole number ≥ 1"
+        raise InputError(text, path=file, property="test_every")
+    frames = [frame._replace(split="train") for frame in frames]
+    for i in range(0, len(frames), int(every)):
+        frames[i] = frames[i]._replace(split="test")
+    run = Listed(found.path, frames)
+    if settings.word("pose_opt") != "true":
+        return run
     text = "the run optimised its poses; these are the poses before training"
-    return Listed(found.path, frames).noted(
-        "optimised_poses", len(frames) * (settings.word("pose_opt") == "true"), text
-    )
+    return run.noted("optimised_poses", len(frames), text)

@@ -29,7 +29,8 @@ def resize(image: Float32, size: Size) -> Float32:
         channels = []
         for values in np.moveaxis(image, 2, 0):
             plane = Image.fromarray(np.ascontiguousarray(values))
-            channels.append(np.asarray(plane.resize(size, Image.Resampling.BILINEAR), np.float32))
+            resized = plane.resize(size, Image.Resampling.BILINEAR)
+            channels.append(np.asarray(resized, np.float32))
         image = np.stack(channels, axis=2)
     return np.ascontiguousarray(image)
 
@@ -37,14 +38,17 @@ def resize(image: Float32, size: Size) -> Float32:
 def _average(image: Float32, length: int, axis: int) -> Float32:
     """Return exact means over `length` equal parts of an axis, from differences of its running sum."""
     count = image.shape[axis]
-    pad = [(1, 0) if i == axis else (0, 0) for i in range(3)]
+    others = [i for i in range(3) if i != axis]
+    pad = [(0, 0), (0, 0), (0, 0)]
+    pad[axis] = (1, 0)
     sums = np.pad(np.cumsum(image, axis=axis, dtype=float), pad)
     edges = np.linspace(0, count, length + 1)
     below = np.minimum(edges.astype(int), count - 1)
-    share = np.expand_dims(edges - below, [i for i in range(3) if i != axis])
+    share = np.expand_dims(edges - below, others)
     low = sums.take(below, axis)
     high = sums.take(below + 1, axis)
-    means = np.diff(low + share * (high - low), axis=axis) * (length / count)
+    at_edges = low + share * (high - low)
+    means = np.diff(at_edges, axis=axis) * (length / count)
     return means.astype(np.float32)
 
 
@@ -70,7 +74,12 @@ def as_saved(image: ArrayLike) -> Float32:
     return to_bytes(image).astype(np.float32) / np.float32(255)
 
 
-def write_png(path: str | Path, image: ArrayLike, *, overwrite: bool = False) -> None:
+def write_png(
+    path: str | Path,
+    image: ArrayLike,
+    *,
+    overwrite: bool = False,
+) -> None:
     """Write (H, W, 3), (H, W, 4) or (H, W) floats in [0, 1] or bytes as an 8-bit PNG, atomically."""
     values = to_bytes(image)
     if values.ndim == 3 and values.shape[2] == 1:
@@ -85,7 +94,6 @@ def write_png(path: str | Path, image: ArrayLike, *, overwrite: bool = False) ->
 def png_bytes(image: ArrayLike) -> bytes:
     """Return an image, as `write_png` takes it, as the content of a PNG file."""
     content = BytesIO()
-    Image.fromarray(np.ascontiguousarray(to_bytes(image))).save(
-        content, format="PNG", compress_level=3
-    )
+    pixels = np.ascontiguousarray(to_bytes(image))
+    Image.fromarray(pixels).save(content, format="PNG", compress_level=3)
     return content.getvalue()

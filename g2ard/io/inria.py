@@ -41,29 +41,38 @@ def read(views: ViewFiles) -> Listed:
     beside = images or file.parent / "images"
     names = [camera.img_name for camera in listed]
     among = Finder.among(images, names, [beside], [file.parent])
-    finder = among if beside.is_dir() or among.notes else None
+    finder = None
+    if beside.is_dir() or among.notes:
+        finder = among
     times = Counter(names)
     frames = []
     for i, camera in enumerate(listed):
         frame = _frame(Place(file, i, "camera"), camera, finder)
         if times[camera.img_name] > 1:
-            number = i if camera.id is None else camera.id
+            number = camera.id
+            if number is None:
+                number = i
             frame = frame._replace(name=f"{frame.name}_{number}")
         frames.append(frame)
+    found = Listed(file, frames, notes=among.notes)
     repeated = sum(count for count in times.values() if count > 1)
-    text = (
-        f"{plural(repeated, 'camera')} of {len(frames)} have repeated names; their ids are appended"
-    )
-    return Listed(file, frames, notes=among.notes).noted("repeated_names", repeated, text)
+    what = f"{plural(repeated, 'camera')} of {len(frames)}"
+    text = f"{what} have repeated names; their ids are appended"
+    return found.noted("repeated_names", repeated, text)
 
 
 def _frame(place: Place, camera: _Camera, finder: Finder | None) -> Frame:
     world_from_camera = np.column_stack([camera.rotation, camera.position])
+    pose = make_rigid(world_from_camera, place.to("rotation"))
+    size = int(camera.width), int(camera.height)
+    photo = None
+    if finder:
+        photo = finder.photo(camera.img_name)
     return Frame(
         name=camera.img_name,
-        viewmat=invert_pose(make_rigid(world_from_camera, place.to("rotation"))),
-        lens=Lens.pinhole((int(camera.width), int(camera.height)), (camera.fx, camera.fy)),
-        photo=finder.photo(camera.img_name) if finder else None,
+        viewmat=invert_pose(pose),
+        lens=Lens.pinhole(size, (camera.fx, camera.fy)),
+        photo=photo,
         listed=camera.img_name,
     )
 

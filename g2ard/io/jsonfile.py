@@ -62,8 +62,13 @@ class Place:
 
     def to(self, *keys: str | int) -> Place:
         """Return the place of a property, or of an entry of a list."""
-        deeper = "".join(f"[{key}]" if isinstance(key, int) else f".{key}" for key in keys)
-        return replace(self, property=f"{self.property}{deeper}".removeprefix("."))
+        path = self.property
+        for key in keys:
+            if isinstance(key, int):
+                path += f"[{key}]"
+            else:
+                path += f".{key}"
+        return replace(self, property=path.removeprefix("."))
 
     def error(self, message: str) -> InputError:
         return InputError(
@@ -83,12 +88,13 @@ def read_json(path: Path) -> Json:
 def read_own(path: Path, format: str, version: int) -> Json:
     """Return the object in a JSON file of g2ard's, which states this format and version."""
     content = read_json(path)
-    if content.get("format") != format:
-        raise Place(path).to("format").error(f"is {content.get('format')!r}, expected {format!r}")
-    if content.get("version") != version:
-        raise InputError(
-            f"unsupported version {content.get('version')!r}; expected {version}", path=path
-        )
+    stated = content.get("format")
+    if stated != format:
+        raise Place(path).to("format").error(f"is {stated!r}, expected {format!r}")
+    stated = content.get("version")
+    if stated != version:
+        text = f"unsupported version {stated!r}; expected {version}"
+        raise InputError(text, path=path)
     return content
 
 
@@ -115,7 +121,12 @@ def parse_json(text: str) -> Any:
         raise InputError(f"not JSON ({error})") from error
 
 
-def checked(value: Any, kind: type[Value], place: Place, entries: str | None = None) -> Value:
+def checked(
+    value: Any,
+    kind: type[Value],
+    place: Place,
+    entries: str | None = None,
+) -> Value:
     """Return JSON content as a type that msgspec knows, such as a struct.
 
     Args:
@@ -137,15 +148,18 @@ def checked(value: Any, kind: type[Value], place: Place, entries: str | None = N
         message, _, at = str(error).partition(" - at `$")
     except RecursionError:
         raise place.error("is nested too deeply") from None
-    for key, index in re.findall(r"\.([^.\[`]+)|\[(\d+)\]", at):
-        value = value[int(index) if index else key]
-        if index and entries is not None and place.index is None:
-            place = Place(place.path, int(index), entries)
+    for name, number in re.findall(r"\.([^.\[`]+)|\[(\d+)\]", at):
+        key = int(number) if number else name
+        value = value[key]
+        if number and entries is not None and place.index is None:
+            place = Place(place.path, int(number), entries)
         else:
-            place = place.to(int(index) if index else key)
-    if lacking := re.fullmatch("Object missing required field `(.+)`", message):
+            place = place.to(key)
+    lacking = re.fullmatch("Object missing required field `(.+)`", message)
+    if lacking:
         raise place.to(lacking[1]).error("is missing")
-    if (length := re.search(r"length (?:>= )?(\d+)", message)) and len(value) < int(length[1]):
+    length = re.search(r"length (?:>= )?(\d+)", message)
+    if length and len(value) < int(length[1]):
         raise place.to(len(value)).error("is missing")
     raise place.error(f"is {_found(value)}, {_wanted(message)}")
 

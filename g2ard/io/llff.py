@@ -14,7 +14,13 @@ from g2ard.progress import plural
 
 NAME = "poses_bounds.npy"
 
-_LLFF_AXES = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+_LLFF_AXES = np.array(
+    [
+        [0.0, 1.0, 0.0],
+        [1.0, 0.0, 0.0],
+        [0.0, 0.0, -1.0],
+    ]
+)
 """Columns that turn down, right, backwards into right, down, forward."""
 
 
@@ -29,21 +35,23 @@ def read(views: ViewFiles) -> Listed:
     """
     file = views.file(NAME)
     try:
-        rows = np.load(
-            file, mmap_mode="r", allow_pickle=False
-        )  # mapped: a header cannot claim more than there is
+        # mapped: a header cannot claim more than there is
+        rows = np.load(file, mmap_mode="r", allow_pickle=False)
     except Exception as error:  # numpy raises any exception for damaged headers
-        raise damaged(
-            f"is not a NumPy array ({' '.join(str(error).split())})", path=file
-        ) from error
-    if rows.ndim != 2 or rows.shape[1] not in (15, 17) or rows.dtype.kind != "f" or not len(rows):
+        reason = " ".join(str(error).split())
+        raise damaged(f"is not a NumPy array ({reason})", path=file) from error
+    is_table = rows.ndim == 2 and len(rows) and rows.shape[1] in (15, 17)
+    if not is_table or rows.dtype.kind != "f":
         shape = "×".join(map(str, rows.shape))
         raise InputError(f"holds {shape} values of {rows.dtype}, expected N×17 numbers", path=file)
     photos = _photos(replace(views, path=file.parent))
     if photos and len(photos) != len(rows):
-        text = f"has {plural(len(rows), 'pose')} for {plural(len(photos), 'photo')} in {photos[0].parent}"
+        poses = plural(len(rows), "pose")
+        found = plural(len(photos), "photo")
         raise InputError(
-            text, path=file, hint="{images=DIR} names the folder with one photo per pose"
+            f"has {poses} for {found} in {photos[0].parent}",
+            path=file,
+            hint="{images=DIR} names the folder with one photo per pose",
         )
     frames = []
     for i, row in enumerate(rows.astype(float)):
@@ -55,12 +63,15 @@ def read(views: ViewFiles) -> Listed:
 
 def _frame(place: Place, matrix: np.ndarray, photo: Path | None) -> Frame:
     height, width, focal = matrix[:, 4].tolist()
-    if not (height >= 1 and width >= 1 and focal > 0 and np.isfinite(matrix).all()):
+    positive = height >= 1 and width >= 1 and focal > 0
+    if not positive or not np.isfinite(matrix).all():
         raise place.error(f"has height {height}, width {width} and focal length {focal}")
     turn = matrix[:, :3] @ _LLFF_AXES
     pose = make_rigid(np.hstack([turn, matrix[:, 3:4]]), place)
     lens = Lens.pinhole((round(width), round(height)), (focal, focal))
-    name = f"{place.index:05d}" if photo is None else photo.name
+    name = f"{place.index:05d}"
+    if photo is not None:
+        name = photo.name
     return Frame(name, invert_pose(pose), lens, photo)
 
 

@@ -47,7 +47,9 @@ def locked(folder: Path, output: str | None = None) -> Iterator[None]:
     """
     path = lock_file(folder, output)
     file = _opened(path)
-    shown = folder if output is None else folder / output
+    shown = folder
+    if output is not None:
+        shown = folder / output
     while not _held(path, file, shown):  # removed by its holder after it was opened
         os.close(file)
         file = _opened(path)
@@ -69,7 +71,9 @@ def check_unlocked(folder: Path, output: str | None = None) -> None:
 
 def lock_file(folder: Path, output: str | None) -> Path:
     """Return the lock file of a folder, or of one output in it."""
-    return folder / (LOCK if output is None else hidden_name(output, LOCK))
+    if output is None:
+        return folder / LOCK
+    return folder / hidden_name(output, LOCK)
 
 
 def _opened(path: Path) -> int:
@@ -87,7 +91,9 @@ def _held(path: Path, file: int, shown: Path) -> bool:
         os.lseek(file, 0, os.SEEK_SET)
         holder = os.read(file, 20).decode("ascii", "replace").strip("\0 ")
         os.close(file)
-        who = f"process {holder}" if holder.isdecimal() else "another process"
+        who = "another process"
+        if holder.isdecimal():
+            who = f"process {holder}"
         hint = "wait for it, or give another output"
         raise OutputError(f"in use by {who}", path=shown, hint=hint) from None
     except OSError:

@@ -60,8 +60,10 @@ def read(views: ViewFiles) -> Listed:
     trained_from_saved = make_rigid(D @ np.linalg.inv(A), place.to("transform"))
     found = Listed(file, [_moved(frame, trained_from_saved, scale) for frame in frames])
     mode = _optimized(settings)
+    if not mode:
+        return found
     text = f"the run optimised its poses ({mode}); these are the poses before training"
-    return found.noted("optimised_poses", len(frames) if mode else 0, text)
+    return found.noted("optimised_poses", len(frames), text)
 
 
 def _data(views: ViewFiles, settings: Settings | None) -> tuple[Sequence[Frame], Float, float]:
@@ -80,14 +82,15 @@ def _data(views: ViewFiles, settings: Settings | None) -> tuple[Sequence[Frame],
         hint = f"give its transforms.json or COLMAP folder as views, or correct `data` in {CONFIG}"
         raise InputError(f"data {data.as_posix()} does not exist", path=folder / CONFIG, hint=hint)
     if parser == "ColmapDataParser":
-        model = place / (options.path("colmap_path") or "colmap/sparse/0")
+        files = ViewFiles(place / (options.path("colmap_path") or "colmap/sparse/0"))
         photos = views.images or place / (options.path("images_path") or "images")
-        return (
-            colmap.listed(ViewFiles(model, photos if photos.is_dir() else None)).whole(),
-            _EYE,
-            1.0,
-        )
-    return _saved(replace(views, path=place), options if parser == "NerfstudioDataParser" else None)
+        if photos.is_dir():
+            files = replace(files, images=photos)
+        return colmap.listed(files).whole(), _EYE, 1.0
+    views = replace(views, path=place)
+    if parser == "NerfstudioDataParser":
+        return _saved(views, options)
+    return _saved(views, None)
 
 
 def _parser(path: Path, settings: Settings) -> tuple[str, Settings, Path]:
@@ -95,43 +98,49 @@ def _parser(path: Path, settings: Settings) -> tuple[str, Settings, Path]:
     parser = manager and manager[1].block("dataparser")
     if not parser or not manager:
         raise InputError("is missing", path=path, property="pipeline.datamanager.dataparser")
-    name = parser[0].rsplit(".", 1)[-1].removesuffix("Config")
+    tag, options = parser
+    name = tag.rsplit(".", 1)[-1].removesuffix("Config")
     if name not in _PARSERS:
-        raise InputError(
-            f"unsupported data parser {name!r}; expected {', '.join(_PARSERS)}", path=path
-        )
-    data = settings.path("data") or manager[1].path("data") or parser[1].path("data")
+        text = f"unsupported data parser {name!r}; expected {', '.join(_PARSERS)}"
+        raise InputError(text, path=path)
+    data = settings.path("data") or manager[1].path("data") or options.path("data")
     if data is None:
         raise InputError("is missing", path=path, property="data")
-    return name, parser[1], data
+    return name, options, data
 
 
 def _saved(views: ViewFiles, options: Settings | None) -> tuple[Sequence[Frame], Float, float]:
     """Return the frames, A and scale of a transforms.json, or of a folder with transforms*.json."""
     data = views.path
-    file = data / "transforms.json" if (data / "transforms.json").is_file() else data
+    file = data / "transforms.json"
+    if not file.is_file():
+        file = data
     frames = transforms.listed(replace(views, path=file)).whole()
     if not frames:
         raise InputError("no transforms.json in the run's data", path=data)
     place = Place(file).to("applied_transform")
-    content = checked(read_json(file) if file.is_file() else {}, _Applied, Place(file))
-    given = content.applied_transform
-    if given is None and options is not None and (file.parent / "colmap" / "sparse" / "0").is_dir():
+    applied = _Applied()
+    if file.is_file():
+        applied = checked(read_json(file), _Applied, Place(file))
+    A = _EYE
+    if applied.applied_transform is not None:
+        A = _affine(applied.applied_transform, place)
+    elif options is not None and (file.parent / "colmap" / "sparse" / "0").is_dir():
         raise place.error("is missing, and its default differs between versions of nerfstudio")
-    A = _EYE if given is None else _affine(given, place)
     if options is not None and not any(frame.split for frame in frames):
         try:
             frames = _split(frames, options)
         except (ValueError, OverflowError) as error:
             raise InputError(f"invalid split in the run's {CONFIG} ({error})", path=data) from error
-    return frames, A, content.applied_scale
+    return frames, A, applied.applied_scale
 
 
 def _split(frames: Sequence[Frame], options: Settings) -> Sequence[Frame]:
     """Assign the run's split by `eval_mode` over sorted photo paths, if views are split at all."""
     count = len(frames)
     mode = options.word("eval_mode")
-    order = sorted(range(count), key=lambda i: frames[i].photo or Path(frames[i].name))
+    photos = [frame.photo or Path(frame.name) for frame in frames]
+    order = sorted(range(count), key=photos.__getitem__)
     rank = np.argsort(order)
     if mode == "fraction":
         fraction = float(options.word("train_split_fraction") or 0.9)
@@ -154,8 +163,10 @@ def _split(frames: Sequence[Frame], options: Settings) -> Sequence[Frame]:
 
 def _optimized(settings: Settings | None) -> str | None:
     optimizer = settings and settings.block("pipeline", "model", "camera_optimizer")
-    mode = optimizer[1].word("mode") if optimizer else None
-    if mode in (None, "off", "false"):
+    if not optimizer:
+        return None
+    mode = optimizer[1].word("mode")
+    if mode in ("off", "false"):
         return None
     return mode
 

@@ -39,21 +39,27 @@ def read(views: ViewFiles) -> Listed:
     model above the photos, scaled to the photos' size.
     """
     path = views.path
-    files = exported(path) if path.is_dir() else [path]
+    files = [path]
+    if path.is_dir():
+        files = exported(path)
+    finder = None
+    if views.images:
+        finder = Finder(views.images)
     lenses: dict[Path, dict[str, Lens]] = {}
     frames = []
-    finder = Finder(views.images) if views.images else None
     for file in files:
         listed = checked(read_any_json(file), list[_Camera], Place(file), entries="camera")
-        frames += [
-            _frame(Place(file, i, "camera"), camera, finder, lenses)
-            for i, camera in enumerate(listed)
-        ]
+        for i, camera in enumerate(listed):
+            place = Place(file, i, "camera")
+            frames.append(_frame(place, camera, finder, lenses))
     return Listed(path, frames)
 
 
 def _frame(
-    place: Place, camera: _Camera, finder: Finder | None, lenses: dict[Path, dict[str, Lens]]
+    place: Place,
+    camera: _Camera,
+    finder: Finder | None,
+    lenses: dict[Path, dict[str, Lens]],
 ) -> Frame:
     path = place.path
     file_path = Path(camera.file_path)
@@ -61,7 +67,9 @@ def _frame(
     there = below(path, file_path)
     ups = (below(path, up) for up in file_path.parents[:3] if up.parts)
     lens = _lens(place, file_path, there or next(filter(None, ups), None), lenses)
-    photo = finder.photo(camera.file_path) if finder else there
+    photo = there
+    if finder:
+        photo = finder.photo(camera.file_path)
     return Frame(
         name=file_path.name,
         viewmat=transforms.opencv_view(world_from_camera),
@@ -73,7 +81,10 @@ def _frame(
 
 
 def _lens(
-    listed: Place, named: Path, place: Path | None, known: dict[Path, dict[str, Lens]]
+    listed: Place,
+    named: Path,
+    place: Path | None,
+    known: dict[Path, dict[str, Lens]],
 ) -> Lens:
     """Return a photo's intrinsics by file name, from the nearest folder above it that has them."""
     for folder in () if place is None else (place, *place.parents[:3]):
@@ -95,9 +106,8 @@ def _lenses(folder: Path) -> dict[str, Lens]:
         frames = colmap.listed(ViewFiles(folder)).whole()
     else:
         return {}
-    names = [Path(frame.photo.name if frame.photo else frame.name).name for frame in frames]
+    names = [(frame.photo or Path(frame.name)).name for frame in frames]
     if len(set(names)) < len(names):
-        raise InputError(
-            "several photos have the same name, so their intrinsics are ambiguous", path=folder
-        )
+        text = "several photos have the same name, so their intrinsics are ambiguous"
+        raise InputError(text, path=folder)
     return {name: frame.lens for name, frame in zip(names, frames, strict=True)}

@@ -33,10 +33,12 @@ def beside(photo: Path | None, place: Path) -> str | None:
     """Return a photo's path relative to the folder of `place`."""
     if photo is None:
         return None
+    photo = real_path(photo)
+    folder = real_path(place.parent)
     try:
-        return Path(os.path.relpath(real_path(photo), real_path(place.parent))).as_posix()
+        return Path(os.path.relpath(photo, folder)).as_posix()
     except ValueError:  # another drive on Windows
-        return real_path(photo).as_posix()
+        return photo.as_posix()
 
 
 def is_special(path: Path) -> bool:
@@ -54,9 +56,8 @@ def check_unpacked(packed: int, unpacked: int, path: Path | None = None) -> None
     """Raise an `InputError` for data that unpacks to over 64 MiB and over 100 times its size, in bytes."""
     most = max(_ALWAYS_UNPACKED, _LARGEST_RATIO * packed)
     if unpacked > most:
-        raise InputError(
-            f"{packed:,} bytes would unpack to {unpacked:,}; the limit is {most:,}", path=path
-        )
+        text = f"{packed:,} bytes would unpack to {unpacked:,}; the limit is {most:,}"
+        raise InputError(text, path=path)
 
 
 @contextmanager
@@ -92,11 +93,13 @@ def decoded(data: bytes) -> str:
 
     Bytes of other character sets become surrogates, see `g2ard.io.finding.readable`.
     """
-    wide = data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+    encoding = "utf-8-sig"
+    errors = "surrogateescape"
+    if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        encoding = "utf-16"
+        errors = "strict"
     try:
-        text = data.decode(
-            "utf-16" if wide else "utf-8-sig", "strict" if wide else "surrogateescape"
-        )
+        text = data.decode(encoding, errors)
     except UnicodeDecodeError as error:
         raise InputError("not a text file") from error
     if "\0" in text:
@@ -141,34 +144,39 @@ def output_names(path: AnyPath, names: Sequence[str]) -> list[str]:
     ['images/a', 'b/c', 'd.png', 'd.jpg']
     """
     resolved = [_inside(path, i, name) for i, name in enumerate(names)]
-    stems = Counter(path.with_suffix("") for path in resolved)
-    places = [
-        path if stems[path.with_suffix("")] > 1 else path.with_suffix("") for path in resolved
-    ]
+    stems = [place.with_suffix("") for place in resolved]
+    alike = Counter(stems)
+    places = []
+    for place, stem in zip(resolved, stems, strict=True):
+        if alike[stem] == 1:
+            place = stem
+        places.append(str(place))
     times = Counter(places)
-    for name, place in zip(names, places, strict=True):
-        if times[place] > 1:
-            raise InputError(
-                f"{name!r} and another view would both be written as {str(place)!r}", path=path
-            )
-    return [str(place) for place in places]
+    for name, written in zip(names, places, strict=True):
+        if times[written] > 1:
+            text = f"{name!r} and another view would both be written as {written!r}"
+            raise InputError(text, path=path)
+    return places
 
 
 def _inside(path: AnyPath, i: int, name: str) -> PurePosixPath:
-    parts = PurePosixPath(PureWindowsPath(name.replace("\0", "")).as_posix()).parts
+    given = PureWindowsPath(name.replace("\0", ""))
     kept = [
-        part for part in parts if part not in ("..", "/", "//") and not part.endswith((":", ":/"))
+        part
+        for part in PurePosixPath(given.as_posix()).parts
+        if part not in ("..", "/", "//") and not part.endswith((":", ":/"))
     ]
-    if (
-        not kept
-        or "\0" in name
-        or max(len(part.encode(errors="replace")) for part in kept) > _LONGEST_NAME
-    ):
-        if len(name) <= _LONGEST_NAME:
-            short = name
-        else:
+    sizes = [len(part.encode(errors="replace")) for part in kept]
+    if not kept or "\0" in name or max(sizes) > _LONGEST_NAME:
+        short = name
+        if len(name) > _LONGEST_NAME:
             short = f"{name[:_LONGEST_NAME]}…"
-        raise InputError(f"has the invalid file name {short!r}", path=path, index=i, item="view")
+        raise InputError(
+            f"has the invalid file name {short!r}",
+            path=path,
+            index=i,
+            item="view",
+        )
     return PurePosixPath(*kept)
 
 
@@ -190,7 +198,8 @@ def user_cache() -> Path:
     else:
         usual = os.environ.get("XDG_CACHE_HOME")
     try:
-        cache = (Path(usual) if usual else Path.home() / ".cache") / "g2ard"
+        caches = Path(usual or Path.home() / ".cache")
+        cache = caches / "g2ard"
         cache.mkdir(parents=True, exist_ok=True)
     except (OSError, RuntimeError):  # in a container, there may be no home, or only to read
         return Path(tempfile.gettempdir()) / "g2ard"

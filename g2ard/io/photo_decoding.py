@@ -26,7 +26,9 @@ def decode_photo(path: Path, like: Size | None = None) -> Float32:
     with open_image(path) as stored:
         wide = _is_deep(stored)
         upright = needs_turn(stored, like)
-        image = ImageOps.exif_transpose(stored) if upright else stored
+        image = stored
+        if upright:
+            image = ImageOps.exif_transpose(stored)
         if image.mode == "F":
             values = np.asarray(image)[..., None]
         elif wide:
@@ -41,7 +43,9 @@ def decode_photo(path: Path, like: Size | None = None) -> Float32:
     if not (values.min() >= 0 and values.max() <= 1):  # also NaN
         text = f"expected values in [0, 1], found {values.min():g} to {values.max():g}"
         raise InputError(text, path=path, hint="convert it to 8 bits")
-    values = np.repeat(values, 3 if values.shape[2] == 1 else 1, axis=2).astype(np.float32)
+    if values.shape[2] == 1:
+        values = np.repeat(values, 3, axis=2)
+    values = values.astype(np.float32)
     if values.shape[2] == 4:
         values[..., :3] *= values[..., 3:]
     return values
@@ -49,15 +53,17 @@ def decode_photo(path: Path, like: Size | None = None) -> Float32:
 
 def _is_deep(image: Image.Image) -> bool:
     """Return whether an image that is not decoded yet has 16 bits per channel, and no colour profile."""
-    return image.mode.startswith("I") or (
-        bool(_raw_mode(image)) and not image.info.get("icc_profile")
-    )
+    if image.mode.startswith("I"):
+        return True
+    return bool(_raw_mode(image)) and not image.info.get("icc_profile")
 
 
 def _raw_mode(image: Any) -> str:
     """Return what Pillow calls the 16-bit colours, or grey and alpha, of an image; nothing for others."""
     found = re.search("(RGB[AX]?|LA);16[BLN]", str(getattr(image, "tile", "")))
-    return found[0] if found else ""
+    if found is None:
+        return ""
+    return found[0]
 
 
 def _read_words(path: Path, image: Any, upright: bool) -> Values:
@@ -68,14 +74,21 @@ def _read_words(path: Path, image: Any, upright: bool) -> Values:
     lower: Any
     with open_image(path) as lower:
         raw = _raw_mode(lower)
-        big = raw[-1] == "B" or (raw[-1] == "N" and sys.byteorder == "big")
-        other = raw[:-1] + ("L" if big else "B")
+        order = raw[-1]
+        if order == "N":
+            order = sys.byteorder[0].upper()
+        other = raw[:-1] + _OTHER_ORDER[order]
         if raw.startswith("LA"):  # only PNGs are
-            lower._mode = other = "RGBA"
+            other = "RGBA"
+            lower._mode = other
         for i, tile in enumerate(lower.tile):
-            rest = () if isinstance(tile.args, str) else tile.args[1:]
-            lower.tile[i] = tile._replace(args=(other, *rest) if rest else other)
-        low = np.asarray(ImageOps.exif_transpose(lower) if upright else lower)
+            args: Any = other
+            if not isinstance(tile.args, str) and len(tile.args) > 1:
+                args = (other, *tile.args[1:])
+            lower.tile[i] = tile._replace(args=args)
+        if upright:
+            lower = ImageOps.exif_transpose(lower)
+        low = np.asarray(lower)
     if raw.startswith("LA"):
         return low.view(">u2")[..., [0, 0, 0, 1]]
     words = np.asarray(image).astype(np.uint16) * 256 + low
@@ -84,6 +97,7 @@ def _read_words(path: Path, image: Any, upright: bool) -> Values:
     return words
 
 
+_OTHER_ORDER = {"B": "L", "L": "B"}  # big-endian, little-endian
 _BITS = (8, 10, 12, 14)  # bits of colours that are stored in 16
 _SAMPLED_PHOTOS = 5  # photos of a folder whose brightest value is compared
 
@@ -91,7 +105,11 @@ _SAMPLED_PHOTOS = 5  # photos of a folder whose brightest value is compared
 def _choose_white(folder: Path, suffix: str, brightest: int) -> float:
     """Return the value of 16 bits that means white: the largest of the bits that the photos use."""
     top = _find_brightest(folder, suffix)
-    return float(next((2**bits - 1 for bits in _BITS if 0 < top < 2**bits > brightest), 65535))
+    if top:
+        for bits in _BITS:
+            if max(top, brightest) < 2**bits:
+                return 2.0**bits - 1
+    return 65535.0
 
 
 @lru_cache(maxsize=64)
@@ -103,20 +121,23 @@ def _find_brightest(folder: Path, suffix: str) -> int:
         with suppress(InputError, OSError), open_image(files[i]) as image:
             if _is_deep(image):
                 words = _read_words(files[i], image, False)[..., :3]
-                found = max(found, int(words.max()) if np.ptp(words) else 0)
+                if np.ptp(words):
+                    found = max(found, int(words.max()))
     return found
 
 
 def _convert_to_srgb(image: Image.Image) -> Image.Image:
     """Return an 8-bit image as RGB or RGBA, with its colour profile converted to sRGB."""
     mode = "RGBA" if image.has_transparency_data else "RGB"
-    change = _make_conversion(
-        image.info.get("icc_profile"), image.mode if image.mode in ("L", "CMYK") else mode
-    )
+    own_mode = mode
+    if image.mode in ("L", "CMYK"):
+        own_mode = image.mode
+    change = _make_conversion(image.info.get("icc_profile"), own_mode)
     if change is None:
         return image.convert(mode)
-    own = image if image.mode in ("L", "CMYK") else image.convert(mode)
-    converted: Image.Image = change.apply(own)
+    if image.mode != own_mode:
+        image = image.convert(own_mode)
+    converted: Image.Image = change.apply(image)
     return converted
 
 
@@ -126,9 +147,11 @@ def _make_conversion(profile: bytes | None, mode: str) -> ImageCms.ImageCmsTrans
     with suppress(ImageCms.PyCMSError, ImportError, OSError, TypeError):
         own = ImageCms.ImageCmsProfile(BytesIO(profile or b""))
         if "srgb" not in ImageCms.getProfileDescription(own).lower():
-            goal = "RGBA" if mode == "RGBA" else "RGB"
-            colorimetric = ImageCms.Intent.RELATIVE_COLORIMETRIC
             return ImageCms.buildTransform(
-                own, ImageCms.createProfile("sRGB"), mode, goal, colorimetric
+                own,
+                ImageCms.createProfile("sRGB"),
+                inMode=mode,
+                outMode="RGBA" if mode == "RGBA" else "RGB",
+                renderingIntent=ImageCms.Intent.RELATIVE_COLORIMETRIC,
             )
     return None

@@ -29,7 +29,12 @@ _SENSOR_PIXELS = 0xA20E  # tag of the sensor's pixels per unit
 _SENSOR_UNIT = 0xA210  # tag of that unit
 _STORED_WIDTH = 0xA002  # tag of the photo's width in pixels
 # millimetres of a unit of sensor pixels: inch, cm, mm and µm
-_UNITS = {2: 25.4, 3: 10.0, 4: 1.0, 5: 1e-3}
+_UNITS = {
+    2: 25.4,
+    3: 10.0,
+    4: 1.0,
+    5: 1e-3,
+}
 _FILM_DIAGONAL = math.hypot(36, 24)  # diagonal of 35 mm film, mm
 
 
@@ -77,7 +82,9 @@ def _begins_with(path: Path, starts: tuple[bytes, ...]) -> bool:
 
 
 def read_size(
-    path: Path, listed_in: Path | None = None, like: tuple[float, float] | None = None
+    path: Path,
+    listed_in: Path | None = None,
+    like: tuple[float, float] | None = None,
 ) -> Size:
     """Read width and height from a photo's header, upright by EXIF if only that fits the size `like`."""
     try:
@@ -86,9 +93,9 @@ def read_size(
                 return swap_sides(image.size)
             return image.size
     except InputError as error:
-        raise (
-            error if listed_in is None else error.at(hint=f"it is listed in {listed_in}")
-        ) from None
+        if listed_in is None:
+            raise
+        raise error.at(hint=f"it is listed in {listed_in}") from None
 
 
 def swap_sides(size: Size) -> Size:
@@ -100,11 +107,9 @@ def needs_turn(image: Image.Image, like: tuple[float, float] | None) -> bool:
 
     Poses refer to stored pixels, unless the size of their views shows that they refer to upright photos.
     """
-    if (
-        like is None
-        or have_same_aspect(image.size, like)
-        or not have_same_aspect(swap_sides(image.size), like)
-    ):
+    if like is None or have_same_aspect(image.size, like):
+        return False
+    if not have_same_aspect(swap_sides(image.size), like):
         return False
     return orientation(image) in (5, 6, 7, 8)
 
@@ -137,9 +142,8 @@ def read_focal(path: Path) -> float | None:
         film = float(tags.get(_FILM_FOCAL, 0))
         found = film * math.hypot(*size) / _FILM_DIAGONAL
         if not film:
-            per_mm = float(tags.get(_SENSOR_PIXELS, 0)) / _UNITS.get(
-                tags.get(_SENSOR_UNIT, 2), 25.4
-            )
+            unit = _UNITS.get(tags.get(_SENSOR_UNIT, 2), 25.4)
+            per_mm = float(tags.get(_SENSOR_PIXELS, 0)) / unit
             resized = size[0] / float(tags.get(_STORED_WIDTH, size[0]))
             found = float(tags.get(_FOCAL, 0)) * per_mm * resized
         if 0.1 < found / max(size) < 100:
@@ -149,7 +153,8 @@ def read_focal(path: Path) -> float | None:
 
 def describe_unreadable(photo: Path) -> str | None:
     """Return the format of a photo that cannot be read, by its suffix and first bytes, or None."""
-    if (by_suffix := other_photo(photo)) is not None:
+    by_suffix = other_photo(photo)
+    if by_suffix is not None:
         return by_suffix
     if _begins_with(photo, _TIFF):
         try:
@@ -159,7 +164,9 @@ def describe_unreadable(photo: Path) -> str | None:
             if not error.hint:
                 return None
             return f"{error.message.removeprefix('is ')} ({error.hint})"
-    sign = None if _begins_with(photo, PHOTOS) else foreign(photo)
+    if _begins_with(photo, PHOTOS):
+        return None
+    sign = foreign(photo)
     if sign is None:
         return None
     return f"{sign.what} ({sign.todo})"

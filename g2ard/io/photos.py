@@ -29,7 +29,9 @@ _BORDER_SHARE = 0.8  # least share of border pixels that have a constant border 
 
 
 def load_photo(
-    cameras: Cameras, index: int, background: Sequence[float] | None = BLACK
+    cameras: Cameras,
+    index: int,
+    background: Sequence[float] | None = BLACK,
 ) -> tuple[Float32, Mask | None]:
     """Read the photo of a view as an image of its pinhole camera, and its mask as `load_mask` does.
 
@@ -43,13 +45,16 @@ def load_photo(
     """
     image = _load_image(cameras, index)
     mask = _load_mask(cameras, index, image)
-    return (image if background is None else composite(image, background)), mask
+    if background is not None:
+        image = composite(image, background)
+    return image, mask
 
 
 def composite(image: Float32, background: Sequence[float]) -> Float32:
     """Composite premultiplied RGBA over a background; RGB is unchanged."""
     if image.shape[2] == 4:
-        image = image[..., :3] + (1 - image[..., 3:]) * np.asarray(background, np.float32)
+        behind = (1 - image[..., 3:]) * np.asarray(background, np.float32)
+        image = image[..., :3] + behind
     return np.ascontiguousarray(image)
 
 
@@ -58,15 +63,16 @@ def _load_image(cameras: Cameras, index: int) -> Float32:
     name = cameras.names[index]
     if path is None:
         raise InputError(
-            f"({name}) has no photo", index=index, item="view", hint="pass views with photos"
+            f"({name}) has no photo",
+            index=index,
+            item="view",
+            hint="pass views with photos",
         )
-    if cameras.source is None:
-        named = None
-    else:
-        named = f"{cameras.source} names it as view {name!r}"
     target = _size_of(cameras, index)
     lens = _lens_of(cameras, index)
-    size = target if lens is None else lens.size
+    size = target
+    if lens is not None:
+        size = lens.size
     try:
         several = cameras.lenses[index] is not None  # views of one photo, which follow each other
         if several:
@@ -74,7 +80,11 @@ def _load_image(cameras: Cameras, index: int) -> Float32:
         else:
             image = decode_photo(path, size)
     except InputError as error:
-        raise error.at(hint="; ".join(filter(None, (error.hint, named))) or None) from error
+        if cameras.source is None:
+            raise
+        named = f"{cameras.source} names it as view {name!r}"
+        hint = "; ".join(filter(None, (error.hint, named)))
+        raise error.at(hint=hint) from error
     height, width = image.shape[:2]
     if not have_same_aspect((width, height), size):
         raise InputError(
@@ -89,11 +99,11 @@ def _load_image(cameras: Cameras, index: int) -> Float32:
 
 def _lens_of(cameras: Cameras, index: int) -> PhotoLens | None:
     """Return the lens of a view's photo; None for a pinhole."""
-    k1, k2, p1, p2, k3 = cameras.distortions[index].tolist()
-    if cameras.lenses[index] is not None or not any((k1, k2, p1, p2, k3)):
+    distortion = cameras.distortions[index].tolist()
+    if cameras.lenses[index] is not None or not any(distortion):
         return cameras.lenses[index]
     (fx, _, cx), (_, fy, cy), _ = cameras.Ks[index].tolist()
-    params = fx, fy, cx, cy, k1, k2, p1, p2, k3, 0.0, 0.0, 0.0
+    params = (fx, fy, cx, cy, *distortion, 0.0, 0.0, 0.0)
     return PhotoLens("FULL_OPENCV", _size_of(cameras, index), params)
 
 
@@ -129,19 +139,25 @@ def measure_traits(files: Sequence[Path]) -> PhotoTraits:
     for i in few:
         with suppress(InputError):
             shown.append(decode_photo(files[i]))
-    if not any(image.shape[2] == 4 and image[..., 3].min() < 1 for image in shown):
+    if not any(map(_is_transparent, shown)):
         alpha = 0
     if alpha or not shown:
         return PhotoTraits(alpha, None, sizes)
-    sides = [
-        side[:, :3] for image in shown for side in (image[0], image[-1], image[:, 0], image[:, -1])
-    ]
+    sides = []
+    for image in shown:
+        rgb = image[..., :3]
+        sides += [rgb[0], rgb[-1], rgb[:, 0], rgb[:, -1]]
     border = np.concatenate(sides)
     colour = np.median(border, axis=0)
     away = np.abs(border - colour).max(1)
-    same = (away <= _BORDER_COLOUR_SLACK).mean() >= _BORDER_SHARE
+    if (away <= _BORDER_COLOUR_SLACK).mean() < _BORDER_SHARE:
+        return PhotoTraits(0, None, sizes)
     red, green, blue = colour.tolist()
-    return PhotoTraits(0, (red, green, blue) if same else None, sizes)
+    return PhotoTraits(0, (red, green, blue), sizes)
+
+
+def _is_transparent(image: Float32) -> bool:
+    return image.shape[2] == 4 and bool(image[..., 3].min() < 1)
 
 
 def load_mask(cameras: Cameras, index: int) -> Mask | None:
@@ -161,14 +177,16 @@ def _load_mask(cameras: Cameras, index: int, image: Float32 | None) -> Mask | No
     if path is None:
         return held
     if path == cameras.image_paths[index]:
-        own = _load_image(cameras, index) if image is None else image
-        mask = own[..., 3] > 0.5 if own.shape[2] == 4 else None
+        if image is None:
+            image = _load_image(cameras, index)
+        if image.shape[2] < 4:
+            return held
+        mask = image[..., 3] > 0.5
     else:
-        mask = _threshold(_load_image(replace(cameras, image_paths=cameras.mask_paths), index))
+        masks = replace(cameras, image_paths=cameras.mask_paths)
+        mask = _threshold(_load_image(masks, index))
         if path.name.lower().startswith(MOVING):
             mask = ~mask
-    if mask is None:
-        return held
     if held is not None:
         mask = mask & held
     return np.ascontiguousarray(mask)
@@ -183,7 +201,9 @@ def _threshold(mask: Float32) -> Mask:
     if mask.shape[2] == 4 and not shade.any():
         return mask[..., 3] > 0.5
     top = float(shade.max())
-    kept: Mask = shade > 0.5 * (top if top >= _LABELS else min(top, 1 / 255))
+    if top < _LABELS:
+        top = min(top, 1 / 255)
+    kept: Mask = shade > 0.5 * top
     return kept
 
 
@@ -198,11 +218,19 @@ def _find_held(cameras: Cameras, index: int) -> Mask | None:
     width, _ = read_size(photo, cameras.source, lens.size)
     times = _samples_per_side(lens, width, K)
     _, samples = _look_up(lens, K, size, times)
-    whole: Mask = np.all(samples.reshape(size[1], times, size[0], times), axis=(1, 3))
-    return None if whole.all() else whole
+    samples = samples.reshape(size[1], times, size[0], times)
+    whole: Mask = np.all(samples, axis=(1, 3))
+    if whole.all():
+        return None
+    return whole
 
 
-def _sample(image: Float32, u: Float, v: Float, around: bool = False) -> Float32:
+def _sample(
+    image: Float32,
+    u: Float,
+    v: Float,
+    around: bool = False,
+) -> Float32:
     """Return the (n, C) values at n places, bilinearly. Pixels have whole numbers, and edges are repeated.
 
     Args:
@@ -214,15 +242,14 @@ def _sample(image: Float32, u: Float, v: Float, around: bool = False) -> Float32
     v = np.clip(v, 0, height - 1)
     left = np.floor(u).astype(int)
     above = np.floor(v).astype(int)
+    below = np.minimum(above + 1, height - 1)
     right = (u - left)[:, None].astype(np.float32)
     down = (v - above)[:, None].astype(np.float32)
     first = left % width
     second = (left + 1) % width
-    top, bottom = (
-        image[row, first] * (1 - right) + image[row, second] * right
-        for row in (above, np.minimum(above + 1, height - 1))
-    )
-    return np.asarray(top * (1 - down) + bottom * down)
+    top = image[above, first] * (1 - right) + image[above, second] * right
+    bottom = image[below, first] * (1 - right) + image[below, second] * right
+    return top * (1 - down) + bottom * down
 
 
 def _modification_time(path: Path) -> int | None:
@@ -238,7 +265,12 @@ def _decode_once(path: Path, modified: int | None, like: Size) -> Float32:
     return decode_photo(path, like)
 
 
-def _resample(image: Float32, lens: PhotoLens, K: Float, size: Size) -> Float32:
+def _resample(
+    image: Float32,
+    lens: PhotoLens,
+    K: Float,
+    size: Size,
+) -> Float32:
     """Sample a photo through its lens for each pixel of a pinhole view: bilinearly at as many points a pixel
     as the photo is finer, which are averaged."""
     height, width = image.shape[:2]
@@ -266,21 +298,34 @@ _MOST_SAMPLES = 8
 
 def _samples_per_side(lens: PhotoLens, width: int, K: Float) -> int:
     """Return the number of samples along each side of a pixel: the pixels of a photo of this width there."""
-    finer = width / lens.size[0] * max(lens.focal) / min(K[0, 0], K[1, 1])
-    return int(np.clip(np.ceil(finer - 0.01), 1, _MOST_SAMPLES))
+    focal = min(K[0, 0], K[1, 1])
+    finer = width / lens.size[0] * max(lens.focal) / focal
+    samples = np.ceil(finer - 0.01)
+    return int(np.clip(samples, 1, _MOST_SAMPLES))
 
 
-def _look_up(lens: PhotoLens, K: Float, size: Size, times: int) -> tuple[Float, Mask]:
+def _look_up(
+    lens: PhotoLens,
+    K: Float,
+    size: Size,
+    times: int,
+) -> tuple[Float, Mask]:
     """Return the pixel of a lens for each sample of a pinhole view, and whether its photo holds it."""
-    keep = _lookup_of_view if lens.model == "FULL_OPENCV" else _lookup_of_face
-    return keep(lens, tuple(K.ravel()), size, times)
+    look_up = _lookup_of_face
+    if lens.model == "FULL_OPENCV":
+        look_up = _lookup_of_view
+    return look_up(lens, tuple(K.ravel()), size, times)
 
 
 def _find_pixels(
-    lens: PhotoLens, K: tuple[float, ...], size: Size, times: int
+    lens: PhotoLens,
+    K: tuple[float, ...],
+    size: Size,
+    times: int,
 ) -> tuple[Float, Mask]:
     turn = np.linalg.inv(np.array(K).reshape(3, 3)).T
-    across, down = ((np.arange(side * times) + 0.5) / times for side in size)
+    across = (np.arange(size[0] * times) + 0.5) / times
+    down = (np.arange(size[1] * times) + 0.5) / times
     bands = []
     for band in _bands(down):
         u, v = (grid.ravel() for grid in np.meshgrid(across, band))

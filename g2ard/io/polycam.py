@@ -12,19 +12,16 @@ from g2ard.io.jsonfile import Number, Place, Whole, checked, read_json
 from g2ard.io.transforms import opencv_view
 from g2ard.io.types import ViewFiles
 
-_FOLDERS = (("corrected_cameras", "corrected_images"), ("cameras", "images"))
+_FOLDERS = (
+    ("corrected_cameras", "corrected_images"),
+    ("cameras", "images"),
+)
 """Folders of cameras and photos: after Polycam's optimisation, and as ARKit tracked them."""
 
 
 _POSE = [f"t_{row}{column}" for row in range(3) for column in range(4)]
-_Keyframe = msgspec.defstruct(
-    "_Keyframe",
-    [
-        *((name, Number) for name in (*_POSE, "fx", "fy", "cx", "cy")),
-        ("width", Whole),
-        ("height", Whole),
-    ],
-)
+_FIELDS = [(name, Number) for name in (*_POSE, "fx", "fy", "cx", "cy")]
+_Keyframe = msgspec.defstruct("_Keyframe", [*_FIELDS, ("width", Whole), ("height", Whole)])
 
 
 def holds(folder: Path) -> bool:
@@ -48,12 +45,14 @@ def read(views: ViewFiles) -> Listed:
     if folders is None:
         raise InputError("has no keyframes/cameras with .json files")
     cameras, photos = folders
-    files = sorted(files_in(cameras, ".json"), key=lambda file: (len(file.stem), file.stem))
+    files = files_in(cameras, ".json")
+    files.sort(key=lambda file: (len(file.stem), file.stem))
     finder = Finder(views.images or photos)
+    found = Listed(views.path, [_frame(file, finder) for file in files])
+    if cameras.name == "corrected_cameras":
+        return found
     text = "the capture has no corrected_cameras; these are ARKit's poses as tracked"
-    tracked = 0 if cameras.name == "corrected_cameras" else len(files)
-    frames = [_frame(file, finder) for file in files]
-    return Listed(views.path, frames).noted("tracked_poses", tracked, text)
+    return found.noted("tracked_poses", len(files), text)
 
 
 def _frame(file: Path, finder: Finder) -> Frame:

@@ -87,7 +87,10 @@ def _nested(value: Any) -> Any:
 
 def _brief(value: Any, most: int) -> str:
     """Return a value in at most `most` characters, collections by their length if they need more."""
-    text = f"{value:.6g}" if isinstance(value, float) else repr(value)
+    if isinstance(value, float):
+        text = f"{value:.6g}"
+    else:
+        text = repr(value)
     if len(text) <= most:
         return text
     if isinstance(value, Report):

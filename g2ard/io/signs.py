@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import zipfile
 import zlib
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from contextlib import suppress
 from fnmatch import fnmatch
 from functools import wraps
@@ -57,7 +57,8 @@ class Sign(NamedTuple):
         starts = tuple(start.lower() for start in self.starts) or b""
         if not head[self.at :].startswith(starts) or path.suffix.lower() in self.unless:
             return False
-        named = any(fnmatch(path.name.lower(), name) for name in self.names.split())
+        own = path.name.lower()
+        named = any(fnmatch(own, name) for name in self.names.split())
         return named and all(word.lower() in head for word in self.words)
 
 
@@ -88,7 +89,11 @@ def _own(suffix: str, start: bytes, *words: bytes) -> Sign:
 
 
 def _poses(
-    what: str, *words: bytes, starts: tuple[bytes, ...] = (), names: str = "*", todo: str = _COLMAP
+    what: str,
+    *words: bytes,
+    starts: tuple[bytes, ...] = (),
+    names: str = "*",
+    todo: str = _COLMAP,
 ) -> Sign:
     return Sign(what, todo, starts, words, names, poses=True)
 
@@ -233,17 +238,20 @@ def _head(path: Path) -> bytes:
         with suppress(Exception), zipfile.ZipFile(path) as bundle:
             names = bundle.namelist()
             head = head[:4] + "\n".join(names).encode(errors="replace")
-            for name in (name for name in names if name.endswith("data.pkl")):
-                with bundle.open(name) as member:
-                    head += member.read(_HEAD)
+            for name in names:
+                if name.endswith("data.pkl"):
+                    with bundle.open(name) as member:
+                        head += member.read(_HEAD)
     elif head.startswith(_GZIP):
         with suppress(zlib.error):
             head = head[:4] + zlib.decompressobj(31).decompress(head, 4096)
     elif b"\0" not in head:
         head = head.removeprefix(b"\xef\xbb\xbf").lstrip()
         head += _shape(head)
-    elif _FEWEST_LINES <= head.count(b"\n", head.index(0)) == head.count(b"\r\n", head.index(0)):
-        head += _AS_TEXT
+    else:
+        binary = head[head.index(0) :]
+        if _FEWEST_LINES <= binary.count(b"\n") == binary.count(b"\r\n"):
+            head += _AS_TEXT
     return head
 
 
@@ -256,27 +264,34 @@ def _shape(head: bytes) -> bytes:
         line.split() for line in head.splitlines()[:20] if line.strip() and line[:1] not in b"#%"
     ]
     try:
-        rows = [[float(word) for word in line] for line in lines[:-1] or lines]
+        rows = [list(map(float, line)) for line in lines[:-1] or lines]
     except ValueError:
         return b""
     count = len(rows[0]) if rows else 0
     if any(len(row) != count for row in rows):
         return b""
-    if count == 8 and _are_unit(row[4:] for row in rows):
+    if count == 8 and all(_is_unit(row[4:]) for row in rows):
         return b"\nnumbers:8 unit"
-    if count == 12 and all(_are_unit(row[at : at + 3] for row in rows) for at in (0, 4, 8)):
+    if count == 12 and all(_is_rigid(row) for row in rows):
         return b"\nnumbers:12 rigid"
     return b"\nnumbers:%d" % count
 
 
-def _are_unit(vectors: Iterable[list[float]]) -> bool:
-    """Return whether vectors have a length of 1, as digits allow."""
-    return all(abs(sum(v * v for v in vector) - 1) < 0.02 for vector in vectors)
+def _is_rigid(row: list[float]) -> bool:
+    """Return whether the rows of a 3×4 matrix turn."""
+    return all(_is_unit(row[at : at + 3]) for at in (0, 4, 8))
+
+
+def _is_unit(vector: list[float]) -> bool:
+    """Return whether a vector has a length of 1, as digits allow."""
+    squared = sum(v * v for v in vector)
+    return abs(squared - 1) < 0.02
 
 
 def is_table(path: Path) -> bool:
     """Return whether a file is text in lines of three numbers or more."""
-    count = _head(path).rpartition(b"\nnumbers:")[2].split(b" ")[0]
+    _, _, shape = _head(path).rpartition(b"\nnumbers:")
+    count = shape.split(b" ")[0]
     return count.isdigit() and int(count) >= 3
 
 
@@ -288,8 +303,12 @@ def explained(read: Callable[Given, Returned]) -> Callable[Given, Returned]:
         try:
             return read(*given, **named)
         except InputError as error:
-            if error.path is not None and error.path.is_file() and (sign := foreign(error.path)):
-                raise sign.error(error.path) from error
-            raise
+            path = error.path
+            if path is None or not path.is_file():
+                raise
+            sign = foreign(path)
+            if sign is None:
+                raise
+            raise sign.error(path) from error
 
     return reading

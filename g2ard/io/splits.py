@@ -23,7 +23,13 @@ HOLD_OUT = 8
 """Without a split file every 8th name is in the test split, as in Mip-NeRF 360's and INRIA's evaluations."""
 
 
-def split_mask(views: Views, names: Sequence[str], which: str, *, stated: Splits = ()) -> Mask:
+def split_mask(
+    views: Views,
+    names: Sequence[str],
+    which: str,
+    *,
+    stated: Splits = (),
+) -> Mask:
     """Return the mask of views in a split.
 
     Splits come from the views themselves, otherwise from a split.json beside them ({"train": [names], "test":
@@ -51,13 +57,11 @@ def split_mask(views: Views, names: Sequence[str], which: str, *, stated: Splits
     if which not in masks:
         raise InputError(f"no split {which!r} (there are {', '.join(sorted(masks))})", path=views)
     if not masks[which].any():
+        of = f"none of its {len(names)} views is"
         if len(names) == 1:
             of = "its only view is not"
-        else:
-            of = f"none of its {len(names)} views is"
-        raise InputError(
-            f"{of} in split {which!r}; add a split.json that says which are", path=views
-        )
+        text = f"{of} in split {which!r}; add a split.json that says which are"
+        raise InputError(text, path=views)
     return masks[which]
 
 
@@ -69,7 +73,11 @@ def states_splits(views: Views, stated: Splits = ()) -> bool:
     return _read_split(path) is not None or _read_apart(path) is not None
 
 
-def splits_of(views: Views, names: Sequence[str], stated: Splits = ()) -> tuple[str | None, ...]:
+def splits_of(
+    views: Views,
+    names: Sequence[str],
+    stated: Splits = (),
+) -> tuple[str | None, ...]:
     """Return the split of each view by the rules of `split_mask`, or None, for writing it with the views.
 
     For a view in several splits, "test" comes before "train", and both before others by name.
@@ -79,10 +87,10 @@ def splits_of(views: Views, names: Sequence[str], stated: Splits = ()) -> tuple[
     """
     masks = _masks(views, names, stated)
     splits: list[str | None] = [None] * len(names)
-    for word in sorted(
-        masks, key=lambda word: (word != "test", word != "train", word), reverse=True
-    ):
-        for i in np.flatnonzero(masks[word]):
+    last = {"train", "test"}
+    words = sorted(masks.keys() - last, reverse=True)
+    for word in [*words, "train", "test"]:
+        for i in np.flatnonzero(masks.get(word, ())):
             splits[i] = word
     return tuple(splits)
 
@@ -91,9 +99,10 @@ def for_training(views: Views, names: Sequence[str], stated: Splits = ()) -> Mas
     """Return the (C,) mask of views to train on when other views are scored: "train" if splits are stated,
     otherwise all. Arguments are those of `split_mask`.
     """
-    return split_mask(
-        views, names, "train" if states_splits(views, stated) else "all", stated=stated
-    )
+    which = "all"
+    if states_splits(views, stated):
+        which = "train"
+    return split_mask(views, names, which, stated=stated)
 
 
 def for_scores(views: Views, names: Sequence[str], stated: Splits = ()) -> Mask:
@@ -103,12 +112,11 @@ def for_scores(views: Views, names: Sequence[str], stated: Splits = ()) -> Mask:
     """
     if not states_splits(views, stated):
         return np.ones(len(names), bool)
-    mask = np.array([split != "train" for split in splits_of(views, names, stated)], bool)
+    splits = splits_of(views, names, stated)
+    mask = np.array([split != "train" for split in splits], bool)
     if not mask.any():
-        raise InputError(
-            f"all of its {len(names)} views are for training; pass views with a test split",
-            path=views,
-        )
+        text = f"all of its {len(names)} views are for training; pass views with a test split"
+        raise InputError(text, path=views)
     return mask
 
 
@@ -117,11 +125,17 @@ def _masks(views: Views, names: Sequence[str], stated: Splits) -> dict[str, Mask
     if any(stated):
         words = {word for word in stated if word}
         return {word: np.array([own == word for own in stated], bool) for word in words}
-    listed = None if views is None else _read_split(Path(views))
-    if listed is None and views is not None and (apart := _read_apart(Path(views))):
+    listed = None
+    apart = None
+    if views is not None:
+        listed = _read_split(Path(views))
+        if listed is None:
+            apart = _read_apart(Path(views))
+    if apart is not None:
         split, wanted = apart
-        if (mask := _listed(names, wanted)).any():
-            return {split: mask, "test" if split == "train" else "train": ~mask}
+        mask = _listed(names, wanted)
+        if mask.any():
+            return {split: mask, _OTHER_SPLIT[split]: ~mask}
     if listed is None:
         photos = [photo_of(name) for name in names]
         held = set(sorted(set(photos))[::HOLD_OUT])
@@ -131,17 +145,23 @@ def _masks(views: Views, names: Sequence[str], stated: Splits) -> dict[str, Mask
     none = np.zeros(len(names), bool)
     both = masks.get("train", none) & masks.get("test", none)
     if both.any():
-        raise InputError(
-            f"split.json lists {names[int(np.argmax(both))]!r} as both train and test", path=views
-        )
+        name = names[int(np.argmax(both))]
+        text = f"split.json lists {name!r} as both train and test"
+        raise InputError(text, path=views)
     return masks
+
+
+_OTHER_SPLIT = {"train": "test", "test": "train"}
 
 
 def split_files(views: Path) -> list[Path]:
     """Return the files with splits that are beside views, see `split_mask`."""
+    places = _places(views)
     model = model_folder(views)
-    places = [*_places(views), *([model] if model else ())]
-    return [place / name for place in places for name in _SPLIT_FILES if usable(place / name)]
+    if model:
+        places.append(model)
+    files = [place / name for place in places for name in _SPLIT_FILES]
+    return list(filter(usable, files))
 
 
 _SPLIT_FILES = ("split.json", "test.txt", "train.txt")
@@ -150,28 +170,32 @@ _SPLIT_FILES = ("split.json", "test.txt", "train.txt")
 def _read_split(views: Path) -> dict[str, list[str]] | None:
     """Read split.json from the views' folder; for a COLMAP model in sparse/ or sparse/N also from the folders
     above it, up to that of sparse/."""
-    path = next((p for place in _places(views) if (p := place / "split.json").is_file()), None)
+    files = (place / "split.json" for place in _places(views))
+    path = next(filter(Path.is_file, files), None)
     if path is None:
         return None
     content: dict[str, Any] = read_json(path)
     lists = {key: value for key, value in content.items() if isinstance(value, list)}
-    if not lists or not all(isinstance(name, str) for value in lists.values() for name in value):
-        raise InputError(
-            'expected lists of names, as in {"train": ["a.jpg"], "test": ["b.jpg"]}', path=path
-        )
+    names = [name for value in lists.values() for name in value]
+    if not lists or not all(isinstance(name, str) for name in names):
+        text = 'expected lists of names, as in {"train": ["a.jpg"], "test": ["b.jpg"]}'
+        raise InputError(text, path=path)
     return lists
 
 
 def _read_apart(views: Path) -> tuple[str, list[str]] | None:
     """Return the split and the names of a test.txt or train.txt beside the tables of a COLMAP model, where
     INRIA's trainer has it, or beside the views."""
+    places = _places(views)
     model = model_folder(views)
-    for place in [*([model] if model else ()), *_places(views)]:
+    if model:
+        places.insert(0, model)
+    for place in places:
         for split in ("test", "train"):
-            if usable(file := place / f"{split}.txt"):
-                return split, [
-                    word for line in read_text(file).splitlines() if (word := line.strip())
-                ]
+            file = place / f"{split}.txt"
+            if usable(file):
+                lines = map(str.strip, read_text(file).splitlines())
+                return split, list(filter(None, lines))
     return None
 
 
@@ -190,10 +214,8 @@ def _listed(names: Sequence[str], wanted: Sequence[str]) -> Mask:
     stems = [PurePosixPath(name).stem for name in photos]
     if len(set(stems)) < len(set(photos)):
         exact = set(wanted)
-        return np.array(
-            [name in exact or photo in exact for name, photo in zip(names, photos, strict=True)],
-            bool,
-        )
+        pairs = zip(names, photos, strict=True)
+        return np.array([not exact.isdisjoint(pair) for pair in pairs], bool)
     chosen = {PurePosixPath(name).stem for name in wanted}
     return np.array([stem in chosen for stem in stems], bool)
 
@@ -206,7 +228,8 @@ def not_held_out(cameras: Cameras, held_out: Cameras) -> Mask:
     rounding = np.finfo(float).eps * np.abs(places).max()
     slack = _SAME_POSE * np.ptp(places, axis=0).max() + rounding
     turns = cameras.viewmats[:, :3, :3]
-    for place, turn in zip(held_out.positions, held_out.viewmats[:, :3, :3], strict=True):
+    poses = zip(held_out.positions, held_out.viewmats[:, :3, :3], strict=True)
+    for place, turn in poses:
         near = np.abs(cameras.positions - place) <= slack
         parallel = np.abs(turns - turn) <= _SAME_POSE
         alike |= near.all(1) & parallel.all((1, 2))
@@ -218,20 +241,24 @@ _SAME_POSE = 1e-6
 
 
 def same_photos(
-    files: Sequence[Path | None], others: Sequence[Path | None], *, copies: bool = False
+    files: Sequence[Path | None],
+    others: Sequence[Path | None],
+    *,
+    copies: bool = False,
 ) -> Mask:
     """Return whether each photo is one of `others`, by whatever name; with `copies`, also by content."""
     known = {real_path(path) for path in others if path is not None}
     alike = np.array([path is not None and real_path(path) in known for path in files], bool)
-    if copies:
-        sizes = {_size(path) for path in known}
-        hashes = set[str]()
-        for row, path in enumerate(files):
-            if path is not None and not alike[row] and _size(path) in sizes - {None}:
-                hashes = hashes or {
-                    content_hash(other) for other in known if _size(other) is not None
-                }
-                alike[row] = content_hash(path) in hashes
+    if not copies:
+        return alike
+    present = [path for path in known if _size(path) is not None]
+    sizes = set(map(_size, present))
+    hashes = set[str]()
+    for row, path in enumerate(files):
+        if path is None or alike[row] or _size(path) not in sizes:
+            continue
+        hashes = hashes or set(map(content_hash, present))
+        alike[row] = content_hash(path) in hashes
     return alike
 
 

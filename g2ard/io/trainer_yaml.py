@@ -7,7 +7,7 @@ It only supports what PyYAML writes for dataclasses: `key: value`, nested blocks
 from __future__ import annotations
 
 import re
-from pathlib import Path, PurePosixPath, PureWindowsPath
+from pathlib import Path, PureWindowsPath
 
 from g2ard.io.finding import plain_parts
 from g2ard.io.paths import read_text, real_path
@@ -28,8 +28,10 @@ class Settings:
     def word(self, key: str) -> str | None:
         """Return a value as text without quotes; None if it is missing, null, empty or an object."""
         at = self._find(key)
-        text = "" if at is None else self._text(at, key)
-        if at is None or text[:1] in ("", *"!&*[{"):
+        if at is None:
+            return None
+        text = self._text(at, key)
+        if text[:1] in ("", *"!&*[{"):
             return None
         for line in self._lines[at + 1 :]:  # continuation lines are indented
             if _indent(line) <= self._indent or not line.strip():
@@ -49,10 +51,10 @@ class Settings:
         text = self._text(at, key)
         if text.startswith("*"):
             anchor = re.compile(rf"&{re.escape(text[1:])}\b")
-            at = next((i for i, line in enumerate(self._lines) if anchor.search(line)), None)
-            if at is None:
-                text = ""
-            else:
+            found = (i for i, line in enumerate(self._lines) if anchor.search(line))
+            at = next(found, None)
+            text = ""
+            if at is not None:
                 text = self._lines[at].split(": ", 1)[-1].strip()
         match = _PATH.match(text)
         if at is None or match is None:
@@ -61,10 +63,11 @@ class Settings:
                 return None
             return Path(word)
         parts = self._items(at)
-        pure = PureWindowsPath if match["kind"] == "Windows" else PurePosixPath
         if not parts:
             return None
-        return Path(pure(*parts).as_posix())
+        if match["kind"] == "Windows":
+            return Path(PureWindowsPath(*parts).as_posix())
+        return Path(*parts)
 
     def block(self, key: str, *deeper: str) -> tuple[str, Settings] | None:
         """Return the tag (class) and the block of a key, or of a key in its block; None if it is missing."""

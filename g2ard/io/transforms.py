@@ -30,7 +30,11 @@ _LEAST_ANGLE = 1e-6  # smallest distance of a field of view from 0 and π, radia
 _TRAIN = "transforms_train.json"
 _TEST = "transforms_test.json"
 
-_APART = {"test_frames": "test", "val_frames": "val", "eval_frames": "test"}
+_APART = {
+    "test_frames": "test",
+    "val_frames": "val",
+    "eval_frames": "test",
+}
 """Further lists of frames, as of ScanNet++, and their splits."""
 
 _SPLITS = ("train", "val", "test")
@@ -38,6 +42,10 @@ _SPLITS = ("train", "val", "test")
 
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 """OpenGL camera axes (y up, looking along −z) to OpenCV's (y down, looking along z)."""
+
+
+_Pixels = Whole | UnsetType
+_Given = Number | UnsetType
 
 
 class _Frame(msgspec.Struct):
@@ -48,16 +56,16 @@ class _Frame(msgspec.Struct):
     mask_path: str | None = None
     camera_model: str = "OPENCV"
     is_fisheye: Any = False
-    w: Whole | UnsetType = UNSET
-    h: Whole | UnsetType = UNSET
-    width: Whole | UnsetType = UNSET
-    height: Whole | UnsetType = UNSET
-    fl_x: Number | UnsetType = UNSET
-    fl_y: Number | UnsetType = UNSET
+    w: _Pixels = UNSET
+    h: _Pixels = UNSET
+    width: _Pixels = UNSET
+    height: _Pixels = UNSET
+    fl_x: _Given = UNSET
+    fl_y: _Given = UNSET
     camera_angle_x: Number | None = None
     camera_angle_y: Number | None = None
-    cx: Number | UnsetType = UNSET
-    cy: Number | UnsetType = UNSET
+    cx: _Given = UNSET
+    cy: _Given = UNSET
     k1: Number = 0.0
     k2: Number = 0.0
     p1: Number = 0.0
@@ -90,7 +98,8 @@ def read(views: ViewFiles) -> Listed:
         return listed(views)
     test = path.parent / _TEST
     if test.is_file():
-        found = _listed(path, {path: "train", test: "test"}, views.images)
+        files = {path: "train", test: "test"}
+        found = _listed(path, files, views.images)
         return found.noted("test_beside", 1, f"{_TEST} beside it has the test views")
     text = f"no {_TEST} beside it; every 8th of its views is held out"
     return listed(views).noted("no_test_beside", 1, text)
@@ -99,7 +108,10 @@ def read(views: ViewFiles) -> Listed:
 def listed(views: ViewFiles) -> Listed:
     """Return the frames of `read`, of a transforms_train.json without the other beside it."""
     path = views.path
-    return _listed(path, {path: None} if path.is_file() else files_of(path), views.images)
+    files: dict[Path, str | None] = {path: None}
+    if not path.is_file():
+        files = files_of(path)
+    return _listed(path, files, views.images)
 
 
 def files_of(folder: Path) -> dict[Path, str | None]:
@@ -111,19 +123,26 @@ def files_of(folder: Path) -> dict[Path, str | None]:
     return {file: split for file, split in named.items() if file.is_file()}
 
 
-def _listed(path: Path, files: Mapping[Path, str | None], among: Path | None) -> Listed:
+def _listed(
+    path: Path,
+    files: Mapping[Path, str | None],
+    among: Path | None,
+) -> Listed:
     frames = list[Frame]()
     left_out = list[tuple[str, InputError]]()
     notes = list[Note]()
     for file, split in files.items():
         own, further = _frames(file, among, left_out, split)
-        frames = frames + own
-        notes = [*notes, *further]
+        frames += own
+        notes += further
     return Listed(path, frames, left_out, tuple(notes))
 
 
 def _frames(
-    path: Path, among: Path | None, left_out: list[tuple[str, InputError]], split: str | None
+    path: Path,
+    among: Path | None,
+    left_out: list[tuple[str, InputError]],
+    split: str | None,
 ) -> tuple[list[Frame], Notes]:
     """Read the frames of a transforms.json, and append views with numbers that are not finite to `left_out`.
 
@@ -131,35 +150,38 @@ def _frames(
     of `test_frames`, `val_frames` and `eval_frames` (as test) are in these splits, the others then in train.
     """
     shared = read_json(path)
-    lists = {
-        key: checked(shared.get(key, []), list[Any], Place(path).to(key))
-        for key in ("frames", *_APART, *(f"{split}_filenames" for split in _SPLITS))
-    }
+    keys = ["frames", *_APART]
+    keys += [f"{split}_filenames" for split in _SPLITS]
+    lists = {key: checked(shared.get(key, []), list[Any], Place(path).to(key)) for key in keys}
     if not lists["frames"]:
         raise InputError("no views found ('frames' is empty)", path=path)
     folder = path.parent
-    above = path.parent.parent
+    above = folder.parent
     names = [str(entry.get("file_path")) for entry in lists["frames"] if isinstance(entry, dict)]
     places = [folder, folder / "images", above / "resized_images"]
     finder = Finder.among(among, names, places, [folder])
     masks = Finder(folder, folder / "masks", above / "resized_anon_masks")
-    apart = [(key, word) for key, word in _APART.items() if lists[key]]
+    split_of_list = {key: word for key, word in _APART.items() if lists[key]}
+    if split_of_list:
+        split = "train"
     frames = []
-    for key, word in [("frames", "train" if apart else split), *apart]:
+    for key, word in [("frames", split), *split_of_list.items()]:
         item = "frame" if key == "frames" else f"{key} entry"
         for i, entry in enumerate(lists[key]):
             place = Place(path, i, item)
             try:
-                frames.append(_frame(place, shared, entry, finder, masks)._replace(split=word))
+                frame = _frame(place, shared, entry, finder, masks)
             except InputError as error:
                 if not isinstance(entry, dict) or _finite(entry):
                     raise
                 left_out.append((str(entry.get("file_path")), error))
-    split_of = _stated(path, lists)
-    if split_of:
-        frames = [
-            frame._replace(split=split_of.get(Path(frame.listed).as_posix())) for frame in frames
-        ]
+            else:
+                frames.append(frame._replace(split=word))
+    stated = _stated(path, lists)
+    if stated:
+        for i, frame in enumerate(frames):
+            name = Path(frame.listed).as_posix()
+            frames[i] = frame._replace(split=stated.get(name))
     return frames, finder.notes
 
 
@@ -184,7 +206,13 @@ def _stated(path: Path, lists: dict[str, list[Any]]) -> dict[str, str]:
     return stated
 
 
-def _frame(place: Place, shared: Json, entry: Any, finder: Finder, masks: Finder) -> Frame:
+def _frame(
+    place: Place,
+    shared: Json,
+    entry: Any,
+    finder: Finder,
+    masks: Finder,
+) -> Frame:
     content = {**shared, **checked(entry, Json, place)}
     folder = place.path.parent
     if "rot_mat" in content:
@@ -197,9 +225,8 @@ def _frame(place: Place, shared: Json, entry: Any, finder: Finder, masks: Finder
     if frame.mask_path is not None:
         mask = masks.find(frame.mask_path)
         if mask is None or (mask.parent == photo.parent and not is_end(frame.mask_path, mask)):
-            raise place.to("mask_path").error(
-                f"is {folder / frame.mask_path}, which does not exist"
-            )
+            text = f"is {folder / frame.mask_path}, which does not exist"
+            raise place.to("mask_path").error(text)
     return Frame(
         name=file_path.removeprefix("./").removeprefix("images/"),
         viewmat=opencv_view(world_from_camera),
@@ -216,8 +243,12 @@ def _from_matrix_city(folder: Path, frame: _Numbered) -> Json:
     Positions are in metres; MatrixCity's pose folders (transforms_train.json) use 100 m instead.
     """
     name = f"{frame.frame_index:04d}.png"
-    places = [within for within in ("", "rgb/", "input/") if (folder / within / name).is_file()]
-    return {"file_path": (places or [""])[0] + name, "transform_matrix": frame.rot_mat}
+    names = [name, f"rgb/{name}", f"input/{name}"]
+    held = (name for name in names if (folder / name).is_file())
+    return {
+        "file_path": next(held, name),
+        "transform_matrix": frame.rot_mat,
+    }
 
 
 def opencv_view(world_from_camera: Float) -> Float:
@@ -227,36 +258,37 @@ def opencv_view(world_from_camera: Float) -> Float:
 
 def _intrinsics(place: Place, frame: _Frame, photo: Path) -> Lens:
     model = "OPENCV_FISHEYE" if frame.is_fisheye else frame.camera_model
-    if model not in (*_MODELS, "OPENCV_FISHEYE", "EQUIRECTANGULAR"):
-        known = ", ".join((*_MODELS, "OPENCV_FISHEYE", "EQUIRECTANGULAR"))
-        error = place.error(f"has an unsupported {model} lens; expected {known}")
+    known = (*_MODELS, "OPENCV_FISHEYE", "EQUIRECTANGULAR")
+    if model not in known:
+        error = place.error(f"has an unsupported {model} lens; expected {', '.join(known)}")
         raise error.at(hint="undistort the photos")
     unused = [name for name in _NO_COEFFICIENTS if getattr(frame, name)]
     if unused and (model in _MODELS or unused != ["k4"]):
-        error = place.to(unused[0]).error(
-            f"is {getattr(frame, unused[0])}; lenses have k1, k2, k3, p1 and p2"
-        )
-        raise error.at(hint="undistort the photos")
-    width, height = _size(place, frame, photo)
+        name = unused[0]
+        text = f"is {getattr(frame, name)}; lenses have k1, k2, k3, p1 and p2"
+        raise place.to(name).error(text).at(hint="undistort the photos")
+    size = _size(place, frame, photo)
     if model == "EQUIRECTANGULAR":
-        if not have_same_aspect((width, height), (2, 1)):
-            raise place.error(
-                f"is a panorama of {width}×{height} pixels, expected twice as wide as high"
-            )
-        return Lens.of(PhotoLens(model, (width, height), ()))
-    lens = _pinhole(place, frame, (width, height))
+        if not have_same_aspect(size, (2, 1)):
+            width, height = size
+            text = f"is a panorama of {width}×{height} pixels, expected twice as wide as high"
+            raise place.error(text)
+        return Lens.of(PhotoLens(model, size, ()))
+    lens = _pinhole(place, frame, size)
     if model in _MODELS:
         return lens
     (fx, _, cx), (_, fy, cy), _ = lens.K
-    params = fx, fy, cx, cy, frame.k1, frame.k2, frame.k3, frame.k4
+    bent = (frame.k1, frame.k2, frame.k3, frame.k4)
+    params = (fx, fy, cx, cy, *bent)
     return Lens.of(PhotoLens(model, lens.size, params))
 
 
 def _pinhole(place: Place, frame: _Frame, size: Size) -> Lens:
     width, height = size
     distortion = (frame.k1, frame.k2, frame.p1, frame.p2, frame.k3)
-    if (K := _matrix(place, frame)) is not None:
-        return Lens((width, height), K, distortion)
+    K = _matrix(place, frame)
+    if K is not None:
+        return Lens(size, K, distortion)
     if frame.fl_x is UNSET:
         fx = _focal(place, "camera_angle_x", frame.camera_angle_x, width)
         if frame.fl_y is UNSET:
@@ -265,29 +297,50 @@ def _pinhole(place: Place, frame: _Frame, size: Size) -> Lens:
             fy = frame.fl_y
     else:  # beside fl_x, camera_angle_y may be of another camera
         fx = frame.fl_x
-        fy = frame.fl_x if frame.fl_y is UNSET else frame.fl_y
+        if frame.fl_y is UNSET:
+            fy = frame.fl_x
+        else:
+            fy = frame.fl_y
     fy = fy or fx
     if fx is None or fy is None:
         raise place.error("has no focal length (fl_x, camera_angle_x, or a 3×3 K or intrinsics)")
-    cx = width / 2 if frame.cx is UNSET else frame.cx
-    cy = height / 2 if frame.cy is UNSET else frame.cy
-    return Lens.pinhole((width, height), (fx, fy), (cx, cy), distortion)
+    if frame.cx is UNSET:
+        cx = width / 2
+    else:
+        cx = frame.cx
+    if frame.cy is UNSET:
+        cy = height / 2
+    else:
+        cy = frame.cy
+    return Lens.pinhole(size, (fx, fy), (cx, cy), distortion)
 
 
 def _matrix(place: Place, frame: _Frame) -> Float | None:
     """Return a frame's 3×3 `K` or `intrinsics`, without skew, or None."""
-    key = next((key for key in ("K", "intrinsics") if isinstance(getattr(frame, key), list)), None)
-    if key is None:
+    if isinstance(frame.K, list):
+        stored = frame.K
+        place = place.to("K")
+    elif isinstance(frame.intrinsics, list):
+        stored = frame.intrinsics
+        place = place.to("intrinsics")
+    else:
         return None
-    rows = checked(getattr(frame, key), tuple[Vector, Vector, Vector], place.to(key))
+    rows = checked(stored, tuple[Vector, Vector, Vector], place)
     K = np.array(rows)
-    if not (K[0, 0] > 0 and K[1, 1] > 0 and K[2].tolist() == [0, 0, 1]):
-        raise place.to(key).error("is not a matrix of focal lengths and a principal point")
-    K[0, 1] = K[1, 0] = 0
+    focal = K.diagonal()[:2]
+    if not (focal > 0).all() or K[2].tolist() != [0, 0, 1]:
+        raise place.error("is not a matrix of focal lengths and a principal point")
+    K[0, 1] = 0
+    K[1, 0] = 0
     return K
 
 
-def _focal(place: Place, key: str, angle: float | None, pixels: int) -> float | None:
+def _focal(
+    place: Place,
+    key: str,
+    angle: float | None,
+    pixels: int,
+) -> float | None:
     if angle is None:
         return None
     if not _LEAST_ANGLE < angle < math.pi - _LEAST_ANGLE:
@@ -300,9 +353,8 @@ def _size(place: Place, frame: _Frame, photo: Path) -> Size:
         if width is not UNSET and height is not UNSET:
             return width, height
     if photo.is_file():
-        if frame.cx is UNSET or frame.cy is UNSET:
-            stated = None
-        else:
+        stated = None
+        if frame.cx is not UNSET and frame.cy is not UNSET:
             stated = (2 * frame.cx, 2 * frame.cy)
         return read_size(photo, place.path, stated)
     error = place.error(f"has neither w and h nor a photo {photo}")
@@ -314,25 +366,31 @@ def text_of(path: Path, cameras: Cameras, splits: Splits) -> str:
 
     Photos are relative to `path`; views without one are named `images/NAME`.
     """
+    head: Json = {"camera_model": "OPENCV"}
     lenses = [intrinsics_of(cameras, i) for i in range(len(cameras))]
-    shared = lenses[0] if all(lens == lenses[0] for lens in lenses) else {}
+    shared = all(lens == lenses[0] for lens in lenses)
+    if shared:
+        head |= lenses[0]
     frames = []
     for i, viewmat in enumerate(cameras.viewmats):
-        photo = mask = None
+        photo = None
+        mask = None
         if cameras.lenses[i] is None:
             photo = cameras.image_paths[i]
             mask = cameras.mask_paths[i]
-        pose = np.asarray(invert_pose(viewmat) @ FLIP)
-        frame = {"file_path": beside(photo, path) or f"images/{cameras.names[i]}"}
-        if (covered := beside(mask, path)) is not None:
+        frame: Json = {"file_path": beside(photo, path) or f"images/{cameras.names[i]}"}
+        covered = beside(mask, path)
+        if covered is not None:
             frame["mask_path"] = covered
-        frames.append({**frame, **({} if shared else lenses[i]), "transform_matrix": pose.tolist()})
-    head: Json = {"camera_model": "OPENCV", **shared}
-    for word in sorted({word for word in splits if word}):
-        names = [
-            frame["file_path"] for frame, own in zip(frames, splits, strict=True) if own == word
-        ]
-        head[f"{word}_filenames"] = names
+        if not shared:
+            frame |= lenses[i]
+        pose = invert_pose(viewmat) @ FLIP
+        frame["transform_matrix"] = pose.tolist()
+        frames.append(frame)
+    names = [frame["file_path"] for frame in frames]
+    for word in sorted(set(filter(None, splits))):
+        own = [name for name, split in zip(names, splits, strict=True) if split == word]
+        head[f"{word}_filenames"] = own
     return json.dumps(head)[:-1] + f', "frames": {json_rows(frames)}}}\n'
 
 
@@ -340,9 +398,19 @@ def intrinsics_of(cameras: Cameras, i: int) -> Json:
     """Return intrinsics as in transforms.json."""
     (fx, _, cx), (_, fy, cy), _ = cameras.Ks[i].tolist()
     k1, k2, p1, p2, k3 = cameras.distortions[i].tolist()
-    size = {"w": int(cameras.widths[i]), "h": int(cameras.heights[i])}
-    pinhole = {"fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy}
-    return {**size, **pinhole, "k1": k1, "k2": k2, "p1": p1, "p2": p2, "k3": k3}
+    return {
+        "w": int(cameras.widths[i]),
+        "h": int(cameras.heights[i]),
+        "fl_x": fx,
+        "fl_y": fy,
+        "cx": cx,
+        "cy": cy,
+        "k1": k1,
+        "k2": k2,
+        "p1": p1,
+        "p2": p2,
+        "k3": k3,
+    }
 
 
 def json_rows(rows: list[Json]) -> str:

@@ -57,15 +57,12 @@ class Points:
     colors: Float32
 
     def __post_init__(self) -> None:
-        if self.positions.ndim != 2 or self.positions.shape[1] != 3:
-            raise InputError(
-                f"expected shape (N, 3), got {self.positions.shape}", parameter="positions"
-            )
-        if self.colors.shape != self.positions.shape:
-            raise InputError(
-                f"expected shape {self.positions.shape}, got {self.colors.shape}",
-                parameter="colors",
-            )
+        shape = self.positions.shape
+        if len(shape) != 2 or shape[1] != 3:
+            raise InputError(f"expected shape (N, 3), got {shape}", parameter="positions")
+        if self.colors.shape != shape:
+            text = f"expected shape {shape}, got {self.colors.shape}"
+            raise InputError(text, parameter="colors")
         object.__setattr__(self, "colors", unit_colors(self.colors).astype(np.float32))
 
     def __repr__(self) -> str:
@@ -116,7 +113,9 @@ class ViewFiles:
 
     def file(self, name: str) -> Path:
         """Return the file of this name in the folder of views, or the file of views."""
-        return self.path / name if self.path.is_dir() else self.path
+        if self.path.is_dir():
+            return self.path / name
+        return self.path
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,8 +135,12 @@ class ViewSet:
     def take(self, mask: Mask) -> ViewSet:
         """Select views by a (C,) mask."""
         rows = np.flatnonzero(mask)
-        splits = tuple(self.splits[i] for i in rows) if self.splits else ()
-        weights = None if self.weights is None else self.weights[rows]
+        splits = self.splits
+        if splits:
+            splits = tuple(splits[i] for i in rows)
+        weights = self.weights
+        if weights is not None:
+            weights = weights[rows]
         return ViewSet(self.cameras.take(rows), self.notes, splits, weights)
 
     def noted(self, code: str, count: int, text: str) -> ViewSet:

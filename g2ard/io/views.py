@@ -38,19 +38,27 @@ def view_format(path: Path, given: ViewFormat | None = None) -> ViewFormat:
     name = path.name.lower()
     if given is None and suffix == "":
         return "colmap"
-    expected = "" if given == "colmap" else ".json"
+    expected = ".json"
+    where = ".json, or as a folder for COLMAP"
+    if given == "colmap":
+        expected = ""
+        where = "a folder"
     if suffix != expected:
-        where = "a folder" if given == "colmap" else ".json, or as a folder for COLMAP"
         raise OutputError(f"views are written as {where}", path=path)
     if given is not None:
         return given
     if name == "cameras.json":
         return "inria"
-    return "nerfstudio" if name.startswith("transforms") else "g2ard"
+    if name.startswith("transforms"):
+        return "nerfstudio"
+    return "g2ard"
 
 
 def lost_views(
-    cameras: Cameras, format: ViewFormat, splits: Sequence[str | None], weighted: bool
+    cameras: Cameras,
+    format: ViewFormat,
+    splits: Sequence[str | None],
+    weighted: bool,
 ) -> list[str]:
     """Describe what a format cannot hold of views."""
     from g2ard.scene.cameras import USUAL
@@ -59,10 +67,14 @@ def lost_views(
         return []
     inria = format == "inria"
     nerfstudio = format == "nerfstudio"
-    middle = [[w / 2, h / 2] for w, h in zip(cameras.widths, cameras.heights, strict=True)]
+    sizes = zip(cameras.widths, cameras.heights, strict=True)
+    middle = [(width / 2, height / 2) for width, height in sizes]
     beside = abs(cameras.Ks[:, :2, 2] - middle).max(axis=1)
     off = int((beside > _OFF_CENTRE).sum())
-    bent = int(cameras.distortions[:, 0 if inria else 4 :].any(axis=1).sum())
+    coefficients = cameras.distortions
+    if not inria:
+        coefficients = coefficients[:, 4:]  # k3
+    bent = int(coefficients.any(axis=1).sum())
     photos = sum(lens is not None for lens in cameras.lenses)
     kinds = sum(kind != USUAL for kind in cameras.kinds)
     lost = [
@@ -78,15 +90,21 @@ def lost_views(
 
 
 def check_views_output(
-    path: str | Path, overwrite: bool = False, format: ViewFormat | None = None
+    path: str | Path,
+    overwrite: bool = False,
+    format: ViewFormat | None = None,
 ) -> Path:
     """Raise the `OutputError` that `write_views` would raise, before any work."""
-    return check_output(path, overwrite, folder=view_format(Path(path), format) == "colmap")
+    folder = view_format(Path(path), format) == "colmap"
+    return check_output(path, overwrite, folder=folder)
 
 
 @checks_arguments
 def read_views(
-    path: str | Path, *, images: str | Path | None = None, split: str = "all"
+    path: str | Path,
+    *,
+    images: str | Path | None = None,
+    split: str = "all",
 ) -> Cameras:
     """Read views.
 
@@ -147,7 +165,8 @@ def read_view_set(
         views = drop_unpictured(views)
     if given.alpha == "mask":
         views = use_alpha_as_masks(views)
-    return views.take(split_mask(path, views.cameras.names, split, stated=views.splits))
+    mask = split_mask(path, views.cameras.names, split, stated=views.splits)
+    return views.take(mask)
 
 
 @checks_arguments
@@ -195,7 +214,9 @@ def write_views(
     kind = view_format(path, format)
     if not len(cameras):
         raise InputError("not written: there are no views", path=path)
+    output = atomic_output
     if kind == "colmap":
+        output = atomic_folder
         texts = colmap.texts_of(cameras)
     elif kind == "inria":
         texts = {"": inria.text_of(cameras)}
@@ -203,9 +224,11 @@ def write_views(
         texts = {"": transforms.text_of(path, cameras, splits)}
     else:
         texts = {"": views.text_of(path, cameras, splits, weights)}
-    with (atomic_folder if kind == "colmap" else atomic_output)(path, overwrite) as temporary:
+    with output(path, overwrite) as temporary:
         for name, text in texts.items():
-            (temporary / name).parent.mkdir(parents=True, exist_ok=True)
-            (temporary / name).write_text(text, encoding="utf-8")
-    if lost := lost_views(cameras, kind, splits, weights is not None):
+            file = temporary / name
+            file.parent.mkdir(parents=True, exist_ok=True)
+            file.write_text(text, encoding="utf-8")
+    lost = lost_views(cameras, kind, splits, weights is not None)
+    if lost:
         warnings.warn(f"{path}: without {', '.join(lost)}", stacklevel=3)  # past `checks_arguments`
