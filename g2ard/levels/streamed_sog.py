@@ -90,10 +90,19 @@ def save_levels(
     if environment is not None:
         environment = environment.narrowed(levels[0].offset)
     tree = cut_tree(levels, rule, work)
-    files = _Files(levels, rule.most, {}, Rounding(moved), error)
-    meta = _write_meta(
-        levels, rule, _describe_node(tree, files), list(files.parts), environment is not None
+    files = _Files(
+        levels,
+        rule.most,
+        {},
+        Rounding(moved),
+        error,
     )
+    root = _describe_node(tree, files)
+    meta = _describe_levels(levels, rule)
+    if environment is not None:
+        meta["environment"] = _ENVIRONMENT_META
+    meta["filenames"] = list(files.parts)
+    meta["tree"] = root
     if work is not None:
         drop_temporaries(work)
         drop_temporaries(path.parent, path.name)
@@ -103,7 +112,11 @@ def save_levels(
             files.write(folder, path, progress)
         else:
             for name in files.parts:  # linked, not moved: an interrupted call resumes from them
-                shutil.copytree((work / name).parent, (folder / name).parent, copy_function=_link)
+                shutil.copytree(
+                    (work / name).parent,
+                    (folder / name).parent,
+                    copy_function=_link,
+                )
         if environment is not None:
             with naming(path / _ENVIRONMENT_META):
                 _write_part(folder / _ENVIRONMENT_META, sog_files(environment))
@@ -116,13 +129,7 @@ def save_levels(
     return sum(written.values())
 
 
-def _write_meta(
-    levels: Sequence[Level],
-    rule: Cut,
-    root: dict[str, Any],
-    names: list[str],
-    has_environment: bool,
-) -> dict[str, Any]:
+def _describe_levels(levels: Sequence[Level], rule: Cut) -> dict[str, Any]:
     counts = [len(level) for level in levels]
     return {
         "version": 1,
@@ -135,9 +142,6 @@ def _write_meta(
         "count": sum(counts),
         "counts": counts,
         "lodLevels": len(levels),
-        **({"environment": _ENVIRONMENT_META} if has_environment else {}),
-        "filenames": names,
-        "tree": root,
     }
 
 
@@ -178,12 +182,18 @@ class _Files:
         """Append a leaf's rows and return their file, offset and count."""
         name, filled = self.last.get(level, ("", self.most + 1))
         if filled > self.most:
-            name = f"{level}_{sum(of == level for of in self.level_of.values())}/meta.json"
+            number = list(self.level_of.values()).count(level)
+            name = f"{level}_{number}/meta.json"
             filled = 0
-            self.parts[name], self.level_of[name] = [], level
+            self.parts[name] = []
+            self.level_of[name] = level
         self.parts[name].append(rows)
         self.last[level] = name, filled + len(rows)
-        return {"file": list(self.parts).index(name), "offset": filled, "count": len(rows)}
+        return {
+            "file": list(self.parts).index(name),
+            "offset": filled,
+            "count": len(rows),
+        }
 
     def write(self, folder: Path, path: Path, progress: Progress) -> None:
         """Write all missing files, each atomically; `path` names them in messages."""
@@ -198,26 +208,33 @@ class _Files:
     def _rows(self, name: str) -> Splats:
         """Return the rows of a file, each leaf's in Morton order."""
         leaves = self.parts[name]
-        splats = self.levels[self.level_of[name]].take(np.concatenate(leaves))
+        level = self.levels[self.level_of[name]]
+        splats = level.take(np.concatenate(leaves))
         starts = np.cumsum([0, *map(len, leaves)])
-        means = splats.means
-        order = [a + packing_order(means[a:b]) for a, b in pairwise(starts)]
+        order = []
+        for begin, end in pairwise(starts):
+            means = splats.means[begin:end]
+            order.append(begin + packing_order(means))
         return splats.take(np.concatenate(order))
 
 
 def _describe_node(tree: Node, files: _Files) -> dict[str, Any]:
     turn = change_of_axes(files.levels[0].axes, "RDF")
     ends = np.array([tree.low, tree.high]) @ turn.T
-    bound = {"min": _round(ends.min(axis=0)), "max": _round(ends.max(axis=0))}
-    if tree.children:
-        return {
-            "bound": bound,
-            "children": [_describe_node(child, files) for child in tree.children],
+    node: dict[str, Any] = {
+        "bound": {
+            "min": _round(ends.min(axis=0)),
+            "max": _round(ends.max(axis=0)),
         }
-    placed = {
-        f"{level}": files.place(level, rows) for level, rows in enumerate(tree.rows) if len(rows)
     }
-    return {"bound": bound, "lods": placed}
+    if tree.children:
+        node["children"] = [_describe_node(child, files) for child in tree.children]
+        return node
+    node["lods"] = {}
+    for level, rows in enumerate(tree.rows):
+        if len(rows):
+            node["lods"][f"{level}"] = files.place(level, rows)
+    return node
 
 
 def _round(values: Sequence[float] | Float) -> list[float]:
@@ -229,21 +246,22 @@ def _list_named(path: Path) -> set[Path]:
     """Return the relative paths of all level files that the folder's `lod-meta.json` names."""
     named = set()
     meta = read_object(path / "lod-meta.json")
-    parts = [
-        *_filter_names(meta, "filenames", _CHUNK_META),
-        *_filter_names(meta, "environment", _CHUNK_META),
-    ]
+    parts = _filter_names(meta, "filenames", _CHUNK_META)
+    parts += _filter_names(meta, "environment", _CHUNK_META)
     for part in map(Path, parts):
         named.add(part)
         for entry in read_object(path / part).values():
             if isinstance(entry, dict):
-                named.update(map(part.with_name, _filter_names(entry, "files", _CHUNK_IMAGE)))
+                images = _filter_names(entry, "files", _CHUNK_IMAGE)
+                named.update(map(part.with_name, images))
     return named
 
 
 @contextmanager
 def replaced(
-    path: Path, overwrite: bool, before: set[Path]
+    path: Path,
+    overwrite: bool,
+    before: set[Path],
 ) -> Iterator[tuple[Path, dict[Path, int]]]:
     """Write a folder atomically, and remove those of the files `before` that it does not have.
 
@@ -252,21 +270,24 @@ def replaced(
     written: dict[Path, int] = {}
     with atomic_folder(path, overwrite) as folder:
         yield folder, written
-        written |= {
-            file.relative_to(folder): file.stat().st_size
-            for file in folder.rglob("*")
-            if file.is_file()
-        }
+        for file in folder.rglob("*"):
+            if file.is_file():
+                written[file.relative_to(folder)] = file.stat().st_size
     stale = [path / file for file in before - written.keys()]
     for file in stale:
         file.unlink(missing_ok=True)
     drop_empty(list({file.parent for file in stale}))
 
 
-def _filter_names(content: dict[str, Any], key: str, pattern: re.Pattern[str]) -> list[str]:
-    value = content.get(key)
-    names = value if isinstance(value, list) else [value]
-    return [name for name in map(str, names) if pattern.fullmatch(name)]
+def _filter_names(
+    content: dict[str, Any],
+    key: str,
+    pattern: re.Pattern[str],
+) -> list[str]:
+    names = content.get(key)
+    if not isinstance(names, list):
+        names = [names]
+    return list(filter(pattern.fullmatch, map(str, names)))
 
 
 def read_object(file: Path) -> dict[str, Any]:

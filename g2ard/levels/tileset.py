@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from itertools import chain
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -34,7 +33,13 @@ from g2ard.scene.shape import longer_axes
 from g2ard.scene.splats import Splats
 from g2ard.scene.transform import unit_up
 
-TILE_OF_SCENE = np.array([[-1.0, 0, 0], [0, 0, -1], [0, -1, 0]])
+TILE_OF_SCENE = np.array(
+    [
+        [-1.0, 0, 0],
+        [0, 0, -1],
+        [0, -1, 0],
+    ]
+)
 """Rotation from the scene's axes to a tile's: glTF's (half a turn about z), then z up instead of y."""
 
 _SCREEN_SPACE_ERROR = 16.0
@@ -76,9 +81,11 @@ class Georeference(Settings):
             height *= metres_of(system)
         to_globe = pyproj.Transformer.from_crs(system, "EPSG:4979", always_xy=True)
         lon, lat, up = to_globe.transform(east, north, height)
-        ahead = to_globe.transform(east, north + 100, height)
+        ahead_lon, ahead_lat, _ = to_globe.transform(east, north + 100, height)
+        ellipsoid = pyproj.Geod(ellps="WGS84")
+        heading, _, _ = ellipsoid.inv(lon, lat, ahead_lon, ahead_lat)
         place = cls(lon, lat, up)
-        return replace(place, heading=pyproj.Geod(ellps="WGS84").inv(lon, lat, *ahead[:2])[0])
+        return replace(place, heading=heading)
 
     def matrix(self) -> Float:
         """Return the (4, 4) matrix from x, y (along the heading), z up to earth-centred coordinates."""
@@ -108,13 +115,10 @@ def map_system(name: str) -> Any:
     try:
         system = pyproj.CRS.from_user_input(name)
     except pyproj.exceptions.CRSError:
-        raise InputError(
-            f"unknown coordinate system {name!r}; expected EPSG:CODE", parameter="place"
-        ) from None
-    if (
-        not system.is_projected
-        or len({axis.unit_conversion_factor for axis in system.axis_info}) > 1
-    ):
+        text = f"unknown coordinate system {name!r}; expected EPSG:CODE"
+        raise InputError(text, parameter="place") from None
+    units = {axis.unit_conversion_factor for axis in system.axis_info}
+    if not system.is_projected or len(units) > 1:
         raise InputError(
             f"{system.name} is not a projected system of one unit",
             parameter="place",
@@ -133,8 +137,10 @@ def is_outside(system: Any, place: Georeference) -> bool:
     area = system.area_of_use
     if area is None:
         return False
-    across = (place.longitude - area.west) % 360 <= (area.east - area.west) % 360
-    return not (across and area.south <= place.latitude <= area.north)
+    width = (area.east - area.west) % 360
+    if (place.longitude - area.west) % 360 > width:
+        return True
+    return not area.south <= place.latitude <= area.north
 
 
 def save_tileset(
@@ -155,11 +161,21 @@ def save_tileset(
     rule = cut or Cut()
     levels, error, moved = aligned(levels)
     tree = cut_tree(levels, rule, work)
-    tiles = _Tiles(levels, rule.most, path, Rounding(moved), error)
+    tiles = _Tiles(
+        levels,
+        rule.most,
+        path,
+        Rounding(moved),
+        error,
+    )
     parts = tiles.of(tree, len(levels) - 1)
     size = float(np.linalg.norm(tree.high - tree.low))
-    root = parts[0] if len(parts) == 1 else _describe_tile(tree, size, parts)
-    matrix = np.eye(4) if place is None else place.matrix()
+    root = parts[0]
+    if len(parts) > 1:
+        root = _describe_tile(tree, size, parts)
+    matrix = np.eye(4)
+    if place is not None:
+        matrix = place.matrix()
     turn = np.eye(4)
     turn[:3, :3] = unit * _turn_upright(axis) @ TILE_OF_SCENE.T
     root["transform"] = (matrix @ turn).T.ravel().tolist()
@@ -169,7 +185,10 @@ def save_tileset(
         "extras": {"counts": [len(level) for level in levels]},
         "extensionsUsed": ["3DTILES_content_gltf"],
         "extensions": {
-            "3DTILES_content_gltf": {"extensionsUsed": extensions, "extensionsRequired": extensions}
+            "3DTILES_content_gltf": {
+                "extensionsUsed": extensions,
+                "extensionsRequired": extensions,
+            }
         },
         "geometricError": unit * max(size, root["geometricError"]),
         "root": root,
@@ -182,7 +201,12 @@ def save_tileset(
     return sum(written.values()), tiles.rounding.notes
 
 
-def check_tiles(path: Path, splats: Splats, ratio: float, cut: Cut | None = None) -> None:
+def check_tiles(
+    path: Path,
+    splats: Splats,
+    ratio: float,
+    cut: Cut | None = None,
+) -> None:
     """Raise the `InputError` of a tile with far rows, before the levels are made.
 
     The coarsest level, reduced by `ratio`, is one tile of the whole scene unless it exceeds the rule.
@@ -198,8 +222,9 @@ def check_tiles(path: Path, splats: Splats, ratio: float, cut: Cut | None = None
 def _turn_upright(direction: ArrayLike) -> Float:
     """Return the (3, 3) rotation of `up` to z, which keeps x in the plane of x and z."""
     axis = unit_up(direction)
-    east = np.eye(3)[0 if abs(axis[0]) < 0.9 else 1]
-    east = east - (east @ axis) * axis
+    across = 0 if abs(axis[0]) < 0.9 else 1
+    east = np.eye(3)[across]
+    east -= (east @ axis) * axis
     east /= np.linalg.norm(east)
     return np.stack([east, np.cross(axis, east), axis])
 
@@ -217,28 +242,32 @@ class _Tiles:
 
     def of(self, node: Node, level: int) -> list[dict[str, Any]]:
         """Return tiles that together show a level, or finer ones where it is empty, and all below it."""
-        below = node.children or (node,)
         rows = [leaf.rows[level] for leaf in node.leaves()]
         count = sum(map(len, rows))
+        finer = []
         if count > self.most and node.children:
-            return list(chain.from_iterable(self.of(part, level) for part in below))
+            for part in node.children:
+                finer += self.of(part, level)
+            return finer
         if level:
-            finer = list(chain.from_iterable(self.of(part, level - 1) for part in below))
-        else:
-            finer = []
+            for part in node.children or (node,):
+                finer += self.of(part, level - 1)
         if not count:
             return finer
         error = 0.0
         if finer:
-            error = max(self._error(level, rows), *(tile["geometricError"] for tile in finer))
+            error = max(tile["geometricError"] for tile in finer)
+            error = max(error, self._error(level, rows))
         name = f"{level}_{len(self.files)}.glb"
         self.files[name] = level, rows, (node.low + node.high) / 2
         return [_describe_tile(node, error, finer) | {"content": {"uri": name}}]
 
     def _error(self, level: int, rows: list[Int]) -> float:
         """Return 16 standard deviations of the median Gaussian, along its two longer axes."""
-        scales = longer_axes(self.levels[level].take(np.concatenate(rows)).scales)
-        return _SCREEN_SPACE_ERROR * float(np.median(np.sqrt(scales.astype(float).prod(axis=1))))
+        splats = self.levels[level].take(np.concatenate(rows))
+        axes = longer_axes(splats.scales).astype(float)
+        sigmas = np.sqrt(axes.prod(axis=1))
+        return _SCREEN_SPACE_ERROR * float(np.median(sigmas))
 
     def content(self, name: str) -> list[bytes]:
         """Return the .glb of a tile, whose node is moved to the middle of its box."""
@@ -251,29 +280,32 @@ class _Tiles:
         return parts
 
 
-def _describe_tile(node: Node, error: float, children: list[dict[str, Any]]) -> dict[str, Any]:
+def _describe_tile(
+    node: Node,
+    error: float,
+    children: list[dict[str, Any]],
+) -> dict[str, Any]:
     middle = TILE_OF_SCENE @ (node.low + node.high) / 2
     half = np.abs(TILE_OF_SCENE @ (node.high - node.low)) / 2
+    half_axes = np.diag(half).ravel()
     tile: dict[str, Any] = {
-        "boundingVolume": {"box": [*middle.tolist(), *np.diag(half).ravel().tolist()]},
+        "boundingVolume": {"box": [*middle.tolist(), *half_axes.tolist()]},
         "geometricError": error,
         "refine": "REPLACE",
     }
-    if not children:
-        return tile
-    return {**tile, "children": children}
+    if children:
+        tile["children"] = children
+    return tile
 
 
 def _list_named(file: Path) -> set[Path]:
     """Return the names of the .glb files beside a tileset.json that it names."""
     tiles = [read_object(file).get("root", {})]
-    names = set()
+    named = set()
     while tiles:
         tile = tiles.pop()
-        names.add(str(tile.get("content", {}).get("uri", "")))
         tiles += tile.get("children", [])
-    return {
-        Path(name)
-        for name in names
-        if name.endswith(".glb") and "/" not in name and "\\" not in name
-    }
+        name = str(tile.get("content", {}).get("uri", ""))
+        if name.endswith(".glb") and "/" not in name and "\\" not in name:
+            named.add(Path(name))
+    return named

@@ -69,7 +69,9 @@ def aligned(levels: Sequence[Level]) -> tuple[list[Level], float, bool]:
     """Return levels with float32 means and one offset, the largest rounding, and whether offsets changed."""
     check_levels(levels)
     first = levels[0]
-    offset = first.narrowed().offset if isinstance(first, Splats) else first.offset
+    offset = first.offset
+    if isinstance(first, Splats):
+        offset = first.narrowed().offset
     moved = bool((offset != first.offset).any())
     found = []
     error = 0.0
@@ -84,7 +86,7 @@ def aligned(levels: Sequence[Level]) -> tuple[list[Level], float, bool]:
 
 def check_levels(levels: Sequence[Level]) -> None:
     """Raise an `InputError` for no levels, empty ones, different offsets, or rows that are not finite."""
-    if not levels or not all(len(level) for level in levels):
+    if not levels or not all(map(len, levels)):
         raise InputError("expected at least one level, none of them empty", parameter="levels")
     if any((level.offset != levels[0].offset).any() for level in levels):
         raise InputError("the levels have different offsets", parameter="levels")
@@ -96,7 +98,11 @@ def check_levels(levels: Sequence[Level]) -> None:
                 raise error.at(message=f"of level {number} {error.message}") from None
 
 
-def cut(levels: Sequence[Level], rule: Cut | None = None, scratch: Path | None = None) -> Node:
+def cut(
+    levels: Sequence[Level],
+    rule: Cut | None = None,
+    scratch: Path | None = None,
+) -> Node:
     """Cut space at medians of the means of all levels, along the longest side of their box.
 
     Args:
@@ -118,9 +124,8 @@ def cut(levels: Sequence[Level], rule: Cut | None = None, scratch: Path | None =
 
 
 def _split_rows(count: int) -> Iterator[slice]:
-    return (
-        slice(start, min(start + _ROWS_AT_ONCE, count)) for start in range(0, count, _ROWS_AT_ONCE)
-    )
+    for start in range(0, count, _ROWS_AT_ONCE):
+        yield slice(start, min(start + _ROWS_AT_ONCE, count))
 
 
 def _measure_reach(splats: Splats) -> Float:
@@ -132,7 +137,12 @@ def _measure_reach(splats: Splats) -> Float:
 class _Tree:
     """Rows of all levels, numbered consecutively; the rows of a node are in ascending order."""
 
-    def __init__(self, levels: Sequence[Level], rule: Cut, scratch: Path | None) -> None:
+    def __init__(
+        self,
+        levels: Sequence[Level],
+        rule: Cut,
+        scratch: Path | None,
+    ) -> None:
         self.levels = levels
         self.rule = rule
         self.scratch = scratch
@@ -144,7 +154,11 @@ class _Tree:
         wide = any(isinstance(level, Splats) and level.means.dtype == float for level in levels)
         self.means = self.room((count, 3), float if wide else np.float32)
         for number, level in enumerate(levels):
-            for block in [level.means] if isinstance(level, Splats) else level.positions():
+            if isinstance(level, Splats):
+                blocks = iter([level.means])
+            else:
+                blocks = level.positions()
+            for block in blocks:
                 if not np.isfinite(block).all():
                     raise InputError(f"a mean of level {number} is not finite", parameter="levels")
                 self.means[at : at + len(block)] = block
@@ -159,16 +173,21 @@ class _Tree:
 
     def of(self, rows: Int, axes: tuple[int, ...]) -> Node:
         """Build the node of these rows; `axes` are the axes of its ancestors' cuts, outermost first."""
+        count = len(rows)
         low, high = self._box(rows)
         sides = high - low
-        wide = sides.max() > self.rule.extent and len(rows) > self.rule.least
-        if len(rows) < 2 or not (wide or len(rows) > self.rule.most):
+        is_wide = sides.max() > self.rule.extent and count > self.rule.least
+        if count < 2 or not (is_wide or count > self.rule.most):
             return self._leaf(rows)
         axis = int(sides.argmax())
         below, above = self._halves(rows, axis, axes)
         one = self.of(below, (*axes, axis))
         other = self.of(above, (*axes, axis))
-        return Node(np.minimum(one.low, other.low), np.maximum(one.high, other.high), (one, other))
+        return Node(
+            np.minimum(one.low, other.low),
+            np.maximum(one.high, other.high),
+            (one, other),
+        )
 
     def _box(self, rows: Int) -> tuple[Float, Float]:
         boxes = []
@@ -178,7 +197,12 @@ class _Tree:
         low, high = np.array(boxes, float).swapaxes(0, 1)
         return low.min(axis=0), high.max(axis=0)
 
-    def _halves(self, rows: Int, axis: int, axes: tuple[int, ...]) -> tuple[Int, Int]:
+    def _halves(
+        self,
+        rows: Int,
+        axis: int,
+        axes: tuple[int, ...],
+    ) -> tuple[Int, Int]:
         """Split rows at the median of `axis`; ties go by earlier cuts' axes, last first, then by row."""
         middle = len(rows) // 2
         values = np.empty(len(rows), self.means.dtype)
@@ -188,12 +212,11 @@ class _Tree:
         limit = values[middle]
         short = middle - int(np.count_nonzero(values < limit))
         del values
-        tied = np.concatenate(
-            [
-                part[self.means[part, axis] == limit]
-                for part in map(rows.__getitem__, _split_rows(len(rows)))
-            ]
-        )
+        ties = []
+        for at in _split_rows(len(rows)):
+            part = rows[at]
+            ties.append(part[self.means[part, axis] == limit])
+        tied = np.concatenate(ties)
         if axes:
             tied = tied[np.lexsort([self.means[tied, a] for a in axes])]
         lower = np.sort(tied[:short])
@@ -202,11 +225,13 @@ class _Tree:
         done = 0
         for at in _split_rows(len(rows)):
             part = rows[at]
-            inside = (self.means[part, axis] < limit) | np.isin(part, lower, assume_unique=True)
+            inside = self.means[part, axis] < limit
+            inside |= np.isin(part, lower, assume_unique=True)
             some = part[inside]
             rest = part[~inside]
+            begin = at.start - done
             below[done : done + len(some)] = some
-            above[at.start - done : at.start - done + len(rest)] = rest
+            above[begin : begin + len(rest)] = rest
             done += len(some)
         return below, above
 
@@ -216,12 +241,14 @@ class _Tree:
         parts = []
         low = np.full(3, np.inf)
         high = np.full(3, -np.inf)
-        for level, start, a, b in zip(self.levels, self.starts, ends, ends[1:], strict=False):
-            part = self.kept[self.filled : self.filled + b - a]
-            part[:] = rows[a:b] - start
+        for number, level in enumerate(self.levels):
+            own = rows[ends[number] : ends[number + 1]]
+            count = len(own)
+            part = self.kept[self.filled : self.filled + count]
+            part[:] = own - self.starts[number]
             parts.append(part)
-            self.filled += b - a
-            if a < b:
+            self.filled += count
+            if count:
                 some = level.take(part)
                 means = some.means.astype(float)
                 reach = _measure_reach(some)
