@@ -46,8 +46,11 @@ class Within:
 
     def __contains__(self, value: float) -> bool:
         low, high = _parse_ends(self.interval)
-        above = value >= low if self.interval[0] == "[" else value > low
-        return above and (value <= high if self.interval[-1] == "]" else value < high)
+        if value == low:
+            return self.interval[0] == "["
+        if value == high:
+            return self.interval[-1] == "]"
+        return low < value < high
 
     def __str__(self) -> str:
         low, high = _parse_ends(self.interval)
@@ -55,7 +58,9 @@ class Within:
             return f"in {self.interval}"
         if math.isinf(low):
             return ""
-        return f"of at least {low:g}" if self.interval[0] == "[" else f"above {low:g}"
+        if self.interval[0] == "[":
+            return f"of at least {low:g}"
+        return f"above {low:g}"
 
 
 @cache
@@ -78,7 +83,8 @@ def check_fields(config: Any) -> None:
     owner: Any = type(config)
     kinds = _find_hints(owner)
     for field in fields(config):
-        _check(field.name, getattr(config, field.name), kinds[field.name])
+        name = field.name
+        _check(name, getattr(config, name), kinds[name])
 
 
 def check_type(name: str, value: Any, kind: Any) -> None:
@@ -92,15 +98,18 @@ def check_type(name: str, value: Any, kind: Any) -> None:
     Traceback (most recent call last):
     g2ard.errors.InputError: seed: expected a whole number or none, got 2.5
     """
-    if not _fits(value, kind):
-        got = repr(value)
-        if len(got) > _LONGEST or "\n" in got:
-            got = f"a value of type {type(value).__name__}"
-        one = isinstance(value, list | tuple) and all(
-            bare(option) in _SCALARS for option in options_of(kind)
-        )
-        wanted, hint = ("one value", "call once per value") if one else (described(kind), None)
-        raise InputError(f"expected {wanted}, got {got}", parameter=name, hint=hint)
+    if _fits(value, kind):
+        return
+    got = repr(value)
+    if len(got) > _LONGEST or "\n" in got:
+        got = f"a value of type {type(value).__name__}"
+    wanted = described(kind)
+    hint = None
+    is_scalar = all(bare(option) in _SCALARS for option in options_of(kind))
+    if is_scalar and isinstance(value, list | tuple):
+        wanted = "one value"
+        hint = "call once per value"
+    raise InputError(f"expected {wanted}, got {got}", parameter=name, hint=hint)
 
 
 def check_seed(name: str, seed: Any) -> None:
@@ -111,8 +120,10 @@ def check_seed(name: str, seed: Any) -> None:
 
 def check_vector(name: str, vector: Any) -> None:
     """Reject a point or direction that is not three finite numbers."""
-    values = vector.tolist() if hasattr(vector, "tolist") else vector
-    if not _fits(values, tuple[float, float, float]) or not all(map(math.isfinite, values)):
+    values = vector
+    if hasattr(vector, "tolist"):
+        values = vector.tolist()
+    if not _fits(values, tuple[Finite, Finite, Finite]):
         raise InputError(f"expected three finite numbers, got {vector!r}", parameter=name)
 
 
@@ -120,9 +131,8 @@ def check_direction(name: str, direction: Any) -> None:
     """Reject a direction that is not three finite numbers, or zero."""
     check_vector(name, direction)
     if not any(direction):
-        raise InputError(
-            f"expected three finite numbers, not all zero, got {direction!r}", parameter=name
-        )
+        text = f"expected three finite numbers, not all zero, got {direction!r}"
+        raise InputError(text, parameter=name)
 
 
 def check_colour(name: str, colour: Any) -> None:
@@ -134,15 +144,16 @@ def check_colour(name: str, colour: Any) -> None:
     """
     if hasattr(colour, "tolist"):
         colour = colour.tolist()
-    if not _fits(colour, tuple[float, float, float]) or not all(
-        0 <= channel <= 1 for channel in colour
-    ):
-        raise InputError(
-            f"expected 3 numbers from 0 to 1 (red, green, blue), got {colour!r}", parameter=name
-        )
+    if not _fits(colour, tuple[Share, Share, Share]):
+        text = f"expected 3 numbers from 0 to 1 (red, green, blue), got {colour!r}"
+        raise InputError(text, parameter=name)
 
 
-_SHARED = {"seed": check_seed, "up": check_direction, "background": check_colour}
+_SHARED = {
+    "seed": check_seed,
+    "up": check_direction,
+    "background": check_colour,
+}
 """Arguments and fields that mean the same everywhere → their checks."""
 
 
@@ -161,15 +172,17 @@ def checks_arguments(function: Callable[P, Result]) -> Callable[P, Result]:
     if hasattr(function, "__wrapped__"):
         return function
     signature = inspect.signature(function)
-    loose = {name for name, p in signature.parameters.items() if p.kind is p.VAR_KEYWORD}
+    parameters = signature.parameters.values()
+    loose = {each.name for each in parameters if each.kind is each.VAR_KEYWORD}
 
     @wraps(function)
     def checked(*args: P.args, **kwargs: P.kwargs) -> Result:
         kinds = _find_hints(function)
-        unknown = [] if loose else [name for name in kwargs if name not in signature.parameters]
-        if unknown:
-            near = nearest(unknown[0], [name for name in signature.parameters if name != "self"])
-            raise UsageError(f"{function.__name__}() has no keyword {unknown[0]!r}; {near}")
+        for name in kwargs:
+            if not loose and name not in signature.parameters:
+                known = [other for other in signature.parameters if other != "self"]
+                near = nearest(name, known)
+                raise UsageError(f"{function.__name__}() has no keyword {name!r}; {near}")
         try:
             bound = signature.bind(*args, **kwargs)
         except TypeError as error:
@@ -182,20 +195,28 @@ def checks_arguments(function: Callable[P, Result]) -> Callable[P, Result]:
     return checked
 
 
-def nearest(name: str, listed: Iterable[str], known: Iterable[str] | None = None) -> str:
+def nearest(
+    name: str,
+    listed: Iterable[str],
+    known: Iterable[str] | None = None,
+) -> str:
     """Return a question for the names most like an unknown one, or else the list.
 
     >>> nearest("ratoi", ["count", "ratio"]), nearest("x", ["count", "ratio"])
     ('did you mean ratio?', 'expected one of count, ratio')
     """
     listed = list(listed)
-    close = get_close_matches(name, sorted(listed if known is None else known), 1)
+    if known is None:
+        known = listed
+    close = get_close_matches(name, sorted(known), 1)
     if close:
         return f"did you mean {close[0]}?"
     return f"expected one of {', '.join(listed)}"
 
 
-def signature_of(other: Callable[P, Any]) -> Callable[[Callable[..., Result]], Callable[P, Result]]:
+def signature_of(
+    other: Callable[P, Any],
+) -> Callable[[Callable[..., Result]], Callable[P, Result]]:
     """Give a function that passes its arguments on the signature of the function that takes them."""
 
     def decorated(function: Any) -> Any:
@@ -215,17 +236,22 @@ def described(kind: Any) -> str:
         return " or ".join(dict.fromkeys(map(described, options_of(kind))))
     if get_origin(kind) is Annotated:
         limits = kind.__metadata__[0]
-        finite = bare(kind) is float and limits.interval.endswith("inf)")
-        return f"{'a finite number' if finite else described(bare(kind))} {limits}".rstrip()
+        number = described(bare(kind))
+        if bare(kind) is float and limits.interval.endswith("inf)"):
+            number = "a finite number"
+        return f"{number} {limits}".rstrip()
     if get_origin(kind) is Literal:
-        return f"one of {', '.join(map(str, get_args(kind)))}{_REMARKS.get(kind, '')}"
+        names = ", ".join(map(str, get_args(kind)))
+        return f"one of {names}{_REMARKS.get(kind, '')}"
     if get_origin(kind) is tuple:
         kinds = get_args(kind)
         if kinds[-1] is Ellipsis:
             return "comma-separated numbers"
         return f"{len(kinds)} comma-separated numbers"
     if get_origin(kind) is Sequence:
-        return "several numbers" if get_args(kind) == (float,) else "several values"
+        if get_args(kind) == (float,):
+            return "several numbers"
+        return "several values"
     words: dict[Any, str] = {
         _Array: "an array of numbers",
         Mapping: "names with values",
@@ -235,17 +261,24 @@ def described(kind: Any) -> str:
         str: "text",
         type(None): "none",
     }
-    return words.get(get_origin(kind) or kind) or str(getattr(kind, "__name__", kind))
+    known = get_origin(kind) or kind
+    if known in words:
+        return words[known]
+    return str(getattr(kind, "__name__", kind))
 
 
 def options_of(kind: Any) -> tuple[Any, ...]:
     """Return the types of a union, or the only type."""
-    return get_args(kind) if get_origin(kind) in _UNIONS else (kind,)
+    if get_origin(kind) in _UNIONS:
+        return get_args(kind)
+    return (kind,)
 
 
 def bare(kind: Any) -> Any:
     """Return a type without its limits."""
-    return get_args(kind)[0] if get_origin(kind) is Annotated else kind
+    if get_origin(kind) is Annotated:
+        return get_args(kind)[0]
+    return kind
 
 
 _REMARKS: dict[Any, str] = {Engine: " (the device gpu runs fused on a GPU)"}
@@ -258,9 +291,17 @@ class _Array:
         return cls
 
 
-_ARRAY_NAMES = dict.fromkeys(
-    ("ArrayLike", "NDArray", "Bytes", "Float", "Float32", "Int", "Mask", "Rows", "Values"), _Array
-)
+_ARRAY_NAMES = {
+    "ArrayLike": _Array,
+    "NDArray": _Array,
+    "Bytes": _Array,
+    "Float": _Array,
+    "Float32": _Array,
+    "Int": _Array,
+    "Mask": _Array,
+    "Rows": _Array,
+    "Values": _Array,
+}
 """Names of array types in annotations. `g2ard.arrays` itself loads numpy, too slow for `--help`."""
 
 
@@ -280,8 +321,10 @@ def _find_hints(owner: Any) -> dict[str, Any]:
 
 
 def _fits(value: Any, kind: Any) -> bool:
-    if kind is _Array or kind is Any:
-        return kind is Any or _is_array(value)
+    if kind is Any:
+        return True
+    if kind is _Array:
+        return _is_array(value)
     origin = get_origin(kind)
     inner = get_args(kind)
     if origin in _UNIONS:
@@ -291,25 +334,24 @@ def _fits(value: Any, kind: Any) -> bool:
     if origin is Literal:
         return isinstance(value, str) and value in inner
     if origin is tuple or origin is Sequence:
-        several = hasattr(value, "__len__") and not isinstance(value, str)
-        if origin is Sequence and several and isinstance(value, list | tuple):
+        is_listed = isinstance(value, list | tuple)
+        if is_listed and origin is Sequence:
             return all(_fits(one, inner[0]) for one in value)
-        if origin is Sequence or not several or inner[-1] is Ellipsis:
-            return several
-        return (
-            isinstance(value, list | tuple)
-            and len(value) == len(inner)
-            and all(map(_fits, value, inner))
-        )
+        if origin is Sequence or inner[-1] is Ellipsis:
+            return hasattr(value, "__len__") and not isinstance(value, str)
+        if not is_listed or len(value) != len(inner):
+            return False
+        return all(map(_fits, value, inner))
     if origin is Mapping:
         return isinstance(value, Mapping)
     if kind is bool:
-        return isinstance(value, bool) or getattr(getattr(value, "dtype", None), "kind", "") == "b"
-    if kind is int or kind is float:
-        number = isinstance(value, Integral if kind is int else Real) and not isinstance(
-            value, bool
-        )
-        return number and not (kind is float and math.isnan(float(value)))
+        dtype = getattr(value, "dtype", None)
+        return isinstance(value, bool) or getattr(dtype, "kind", "") == "b"
+    if kind is int:
+        return isinstance(value, Integral) and not isinstance(value, bool)
+    if kind is float:
+        is_number = isinstance(value, Real) and not isinstance(value, bool)
+        return is_number and not math.isnan(float(value))
     if not isinstance(kind, type) or getattr(kind, "_is_protocol", False):
         return True
     return isinstance(value, kind)
@@ -323,4 +365,6 @@ def _is_array(value: Any) -> bool:
             value = np.asarray(value)
         except (TypeError, ValueError):  # rows of several lengths
             return False
-    return value.ndim > 0 and (not isinstance(value, np.ndarray) or value.dtype.kind in "biuf")
+    if isinstance(value, np.ndarray) and value.dtype.kind not in "biuf":
+        return False
+    return bool(value.ndim > 0)

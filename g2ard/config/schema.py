@@ -72,9 +72,12 @@ class Settings:
         others = [other for other, kind in cls._variants.items() if name in _list_names(kind)]
         if not others:
             return InputError(
-                "is no setting", parameter=name, hint=f"there are {', '.join(_list_names(cls))}"
+                "is no setting",
+                parameter=name,
+                hint=f"there are {', '.join(_list_names(cls))}",
             )
-        own = own or next(variant for variant, kind in cls._variants.items() if kind is cls)
+        if not own:
+            own = next(variant for variant, kind in cls._variants.items() if kind is cls)
         reason = f"has no effect on the {cls._tag} {own}, only on {' and '.join(others)}"
         return InputError(reason, parameter=name)
 
@@ -85,11 +88,13 @@ class Settings:
             return self
         kind = self._variant(name)
         usual = type(self)(**{tag: getattr(self, tag)})
-        changed = {
-            field: value for field, value in vars(self).items() if value != getattr(usual, field)
-        }
-        kept = {field: value for field, value in changed.items() if field in _list_names(kind)}
-        return kind(**{**kept, tag: name})
+        kept = {}
+        for field in vars(self).keys() & _list_names(kind).keys():
+            value = getattr(self, field)
+            if value != getattr(usual, field):
+                kept[field] = value
+        kept[tag] = name
+        return kind(**kept)
 
 
 def _list_names(kind: Any) -> dict[str, None]:
@@ -113,7 +118,8 @@ def parse_settings(texts: Iterable[str], config: Any) -> dict[str, Any]:
         if not equals:
             raise InputError(f"expected PATH=VALUE, got {text!r}")
         path = _expand(name.strip(), known)
-        values[path] = _read(path, value.strip(), known[path].kind)
+        kind = known[path].kind
+        values[path] = _read(path, value.strip(), kind)
     return values
 
 
@@ -128,24 +134,29 @@ def full_paths(values: Mapping[str, Any], config: Any) -> dict[str, Any]:
     found = {}
     for name, value in values.items():
         path = _expand(name, known)
-        if get_origin(known[path].kind) is tuple and hasattr(value, "tolist"):
+        leaf = known[path]
+        if get_origin(leaf.kind) is tuple and hasattr(value, "tolist"):
             value = tuple(value.tolist())
-        if not hasattr(known[path].value, "named"):
-            check_type(name, value, known[path].kind)
+        if not hasattr(leaf.value, "named"):
+            check_type(name, value, leaf.kind)
         found[path] = value
     return found
 
 
-def keywords(function: Callable[..., Any], config: Any, given: Mapping[str, Any]) -> dict[str, Any]:
+def keywords(
+    function: Callable[..., Any],
+    config: Any,
+    given: Mapping[str, Any],
+) -> dict[str, Any]:
     """Return settings given as keywords of a function that are not None.
 
     A name that is neither an argument nor the end of a path of `config` is answered by the nearest of these.
     """
-    arguments = [
-        name for name, p in signature(function).parameters.items() if p.kind is not p.VAR_KEYWORD
-    ]
+    parameters = signature(function).parameters.values()
+    arguments = [each.name for each in parameters if each.kind is not each.VAR_KEYWORD]
     paths = {leaf.path for leaf in _list_leaves(config, every=True)}
-    known = {*arguments, *(path.rpartition(".")[2] for path in paths)}
+    known = {path.rpartition(".")[2] for path in paths}
+    known.update(arguments)
     for name in given:
         if name not in known and name not in paths and "." not in name:
             raise InputError(f"unknown keyword {name!r}; {nearest(name, arguments, known)}")
@@ -175,10 +186,11 @@ def listed(config: Any) -> dict[str, Any]:
     >>> listed(RecoverConfig())["recover.regularizers.period"]
     100
     """
-    return {
-        path: str(value) if isinstance(value, float) and math.isinf(value) else value
-        for path, value in values_of(config).items()
-    }
+    values = values_of(config)
+    for path, value in values.items():
+        if isinstance(value, float) and math.isinf(value):
+            values[path] = str(value)
+    return values
 
 
 def values_of(config: Any) -> dict[str, Any]:
@@ -189,7 +201,8 @@ def values_of(config: Any) -> dict[str, Any]:
     >>> changed(RecoverConfig(), values_of(config)) == config
     True
     """
-    return {leaf.path: leaf.value for leaf in _list_leaves(config) if not is_dataclass(leaf.value)}
+    leaves = _list_leaves(config)
+    return {leaf.path: leaf.value for leaf in leaves if not is_dataclass(leaf.value)}
 
 
 @dataclass(frozen=True)
@@ -201,27 +214,38 @@ class _Leaf:
     value: Any
 
 
-def _list_leaves(config: Any, root: str | None = None, every: bool = False) -> Iterator[_Leaf]:
+def _list_leaves(
+    config: Any,
+    root: str | None = None,
+    every: bool = False,
+) -> Iterator[_Leaf]:
     """List what can be set; with `every`, also in other variants."""
-    root = _name_root(config) if root is None else root
+    if root is None:
+        root = _name_root(config)
     owner: Any = type(config)
     kinds = _find_kinds(owner)
     for f in fields(config):
-        path = _join(root, f.name)
-        value = getattr(config, f.name)
+        name = f.name
+        path = _join(root, name)
+        value = getattr(config, name)
         if is_dataclass(value):
             if hasattr(value, "named"):
                 yield _Leaf(path, str, value)
             if not (every and f.metadata.get("whole")):
                 yield from _list_leaves(value, path, every)
         elif f.metadata.get("setting", True):
-            chosen = every and f.name == getattr(config, "_tag", None)
-            yield _Leaf(path, Literal[tuple(config._variants)] if chosen else kinds[f.name], value)
-    for kind in getattr(config, "_variants", {}).values() if every else ():
-        kinds = _find_kinds(kind)
-        for f in fields(kind):
-            if f.name not in _list_names(config):
-                yield _Leaf(_join(root, f.name), kinds[f.name], f.default)
+            kind = kinds[name]
+            if every and name == getattr(config, "_tag", None):
+                kind = Literal[tuple(config._variants)]
+            yield _Leaf(path, kind, value)
+    if not every:
+        return
+    for variant in getattr(config, "_variants", {}).values():
+        kinds = _find_kinds(variant)
+        for f in fields(variant):
+            name = f.name
+            if name not in _list_names(config):
+                yield _Leaf(_join(root, name), kinds[name], f.default)
 
 
 @cache
@@ -232,12 +256,16 @@ def _find_kinds(config: type) -> dict[str, Any]:
 def _name_root(config: Any) -> str:
     if all(is_dataclass(getattr(config, f.name)) for f in fields(config)):
         return ""
-    kinds = [kind for kind in type(config).__mro__ if vars(kind).get("_tag")] or [type(config)]
-    return kinds[0].__name__.removesuffix("Config").lower()
+    owner = type(config)
+    tagged = (kind for kind in owner.__mro__ if vars(kind).get("_tag"))
+    kind = next(tagged, owner)
+    return kind.__name__.removesuffix("Config").lower()
 
 
 def _join(root: str, name: str) -> str:
-    return f"{root}.{name}" if root else name
+    if not root:
+        return name
+    return f"{root}.{name}"
 
 
 def _change(config: Any, root: str, values: Mapping[str, Any]) -> Any:
@@ -246,21 +274,24 @@ def _change(config: Any, root: str, values: Mapping[str, Any]) -> Any:
         try:
             chosen = values.get(_join(root, config._tag), getattr(config, config._tag))
             config = config.turned(chosen)
+            own = _list_names(config)
             for kind in config._variants.values():
                 for name in _list_names(kind):
-                    if name not in _list_names(config) and _join(root, name) in values:
+                    if name not in own and _join(root, name) in values:
                         raise config._unknown(name, chosen)
         except InputError as error:
             raise error.at(parameter=_join(root, str(error.parameter))) from None
     for f in fields(config):
-        path = _join(root, f.name)
-        held = getattr(config, f.name)
+        name = f.name
+        path = _join(root, name)
+        held = getattr(config, name)
         if is_dataclass(held) and not isinstance(held, type):
-            inner = _change(_resolve_whole(held, values.get(path, held), path), path, values)
+            whole = _resolve_whole(held, values.get(path, held), path)
+            inner = _change(whole, path, values)
             if inner != held:
-                new[f.name] = inner
+                new[name] = inner
         elif path in values:
-            new[f.name] = values[path]
+            new[name] = values[path]
     if not new:
         return config
     try:
@@ -293,9 +324,9 @@ def _expand(name: str, known: Mapping[str, Any]) -> str:
     if same:
         raise InputError(f"ambiguous setting {name!r}; use {' or '.join(same)}")
     prefix, _, last = name.rpartition(".")
-    close = get_close_matches(last, sorted({path.rpartition(".")[2] for path in known}), 3, 0.6)
+    words = {path.rpartition(".")[2] for path in known}
     near = []
-    for word in close:
+    for word in get_close_matches(last, sorted(words), 3, 0.6):
         near += [path for path in known if path.endswith(f".{word}")]
     if near:
         raise InputError(f"unknown setting {name!r}; did you mean {' or '.join(near)}?")
@@ -320,20 +351,22 @@ def _parse(kind: Any, text: str) -> Any:
     if get_origin(kind) is tuple:
         kinds = get_args(kind)
         text = text.strip("()[]")
-        if kinds[-1] is Ellipsis:
-            mark = ";" if get_origin(kinds[0]) is tuple else ","
-            return tuple(
-                _parse(kinds[0], part.strip()) for part in text.split(mark) if part.strip()
-            )
-        return tuple(
-            _parse(k, part.strip()) for k, part in zip(kinds, text.split(","), strict=True)
-        )
+        if kinds[-1] is not Ellipsis:
+            parts = map(str.strip, text.split(","))
+            return tuple(_parse(kind, part) for kind, part in zip(kinds, parts, strict=True))
+        mark = ","
+        if get_origin(kinds[0]) is tuple:
+            mark = ";"
+        parts = map(str.strip, text.split(mark))
+        return tuple(_parse(kinds[0], part) for part in parts if part)
     if kind is type(None) and text.lower() == "none":
         return None
     if kind is bool and text.lower() in ("true", "false"):
         return text.lower() == "true"
     if kind is str:
         return text
-    if kind is int or (kind is float and not math.isnan(float(text))):
-        return kind(text)
+    if kind is int:
+        return int(text)
+    if kind is float and not math.isnan(float(text)):
+        return float(text)
     raise ValueError(text)
