@@ -157,7 +157,8 @@ class RunFolder:
     @contextmanager
     def _hold_checkpoints(self, job: DistillJob) -> Iterator[None]:
         """Create the folder for checkpoints; after an error or Ctrl-C, keep what it holds."""
-        if self._resume and not has_checkpoints(self.unfinished):
+        # a run in tiles continues from their files
+        if self._resume and job.plan is None and not has_checkpoints(self.unfinished):
             self._run.say(f"{self.path}: nothing to resume, starting over")
         with keep_checkpoints(
             self._run, self.unfinished, self._resume, self.path, f"in {self.path}"

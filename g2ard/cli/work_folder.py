@@ -112,7 +112,10 @@ def work_folder(
                     run.kept.insert(0, f"finished work is kept in {folder}")
                 raise
             except KeyboardInterrupt:
-                left = f"finished steps are in {folder}; run the same command{again} to continue"
+                left = f"finished steps are in {folder}"
+                # checkpoints of recovery name the way themselves
+                if not any("to continue" in text for text in run.kept):
+                    left += f"; run the same command{again} to continue"
                 run.kept.insert(0, left)
                 raise
             if not tiling.keep:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -26,7 +26,7 @@ from g2ard.stages.simplify import SimplifyConfig
 from g2ard.tiles.simplify import sample_stride
 
 if TYPE_CHECKING:
-    pass
+    from g2ard.jobs.budget import Budget
 
 
 @dataclass(eq=False)
@@ -75,6 +75,7 @@ def open_tiles(
     config: SimplifyConfig,
     lifting: LiftConfig | None = None,
     *,
+    budgets: Sequence[Budget] = (),
     planned: bool = False,
     progress: Progress = silent,
     say: Say = unsaid,
@@ -87,6 +88,7 @@ def open_tiles(
         times: memory of a tile relative to merging it.
         config: of merges.
         lifting: how points are lifted.
+        budgets: rejected before tiles are written if these cannot have so many Gaussians or so few.
         planned: only plan this; nothing is written.
     """
     from g2ard.tiles.dense import InTiles
@@ -107,8 +109,11 @@ def open_tiles(
     def running(plan: TilePlan) -> AbstractContextManager[Executor]:
         return executor(plan.workers, max(1, tiling.usable_cores // plan.workers), tiling.scheduler)
 
+    name = str(source)
+    plan = plan_tiles(store or stream, tiling, times)
+    _check_budgets(budgets, plan, name)
     if store is None and not planned:
-        with running(plan_tiles(stream, tiling, times)) as runs:
+        with running(plan) as runs:
             store = ingest(
                 source,
                 tiling.folder / "tiles",
@@ -119,7 +124,8 @@ def open_tiles(
                 progress=progress,
                 say=say,
             )
-    plan = plan_tiles(store or stream, tiling, times)
+        plan = plan_tiles(store, tiling, times)
+        _check_budgets(budgets, plan, name)
     say(f"{plan.tiles:,} tiles of {plan.count:,} Gaussians, {plan.workers} at a time")
     if planned or store is None:
         yield Opened(
@@ -132,6 +138,14 @@ def open_tiles(
         yield Opened(
             InTiles(store, workers, config, tiling.most_rows, tiling.folder), plan, store.notes
         )
+
+
+def _check_budgets(budgets: Sequence[Budget], plan: TilePlan, name: str) -> None:
+    from g2ard.tiles.merging import check_reachable
+
+    for budget in budgets:
+        if not budget.is_measured:
+            check_reachable(budget.of(plan.count, name), plan.tiles)
 
 
 def _sample_stream(stream: SceneStream | PointStream, lifting: LiftConfig | None) -> Splats:

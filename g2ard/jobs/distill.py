@@ -225,6 +225,7 @@ def open_job(
     split = None
     if scene.kind == "points" and options.photo_views is not None:
         split = split_views(options.photo_views, options.held_out, options.say)
+        _require_photos(split[0].cameras, split[1], "a trained scene")
         if not scene.others and is_sparse_file(scene, options.photo_views):
             source = keep_seen_points(scene, split[0].cameras)
         source = colored_source(source, split[0].cameras, planned=options.planned)
@@ -234,6 +235,7 @@ def open_job(
         RECOVERY_TIMES,
         config.simplify,
         config.lift,
+        budgets=[budget] if budget is not None else [],
         planned=options.planned,
         progress=options.progress,
         say=options.say,
@@ -367,18 +369,12 @@ def _choose_teaching(
     options: DistillOptions, start: Start, dense: Dense, views: RunViews
 ) -> Teaching:
     """Decide whether photos are targets, and whether renders of the dense scene are, at least elsewhere."""
-    names = (*views.train.cameras.names, *views.test.names)
+    if start.needs_photos:
+        _require_photos(views.train.cameras, views.test, "a trained scene")
+    elif options.photos:
+        otherwise = "leave out {photos} to render the scene there"
+        _require_photos(views.train.cameras, views.test, otherwise)
     paths = (*views.train.cameras.image_paths, *views.test.image_paths)
-    if (start.needs_photos or options.photos) and None in paths:
-        scene = (
-            "a trained scene"
-            if start.needs_photos
-            else "leave out {photos} to render the scene there"
-        )
-        raise InputError(
-            f"view {names[paths.index(None)]} has no photo",
-            hint=f"give views with photos, their {{images=DIR}}, or {scene}",
-        )
     photos = options.photos
     if photos is None or start.needs_photos:
         photos = start.needs_photos or any(paths)
@@ -395,6 +391,17 @@ def _choose_teaching(
         say=options.say,
         limit=limit,
     )
+
+
+def _require_photos(train: Cameras, test: Cameras, otherwise: str) -> None:
+    """Reject views of which one has no photo; `otherwise` says what helps besides photos."""
+    names = (*train.names, *test.names)
+    paths = (*train.image_paths, *test.image_paths)
+    if None in paths:
+        raise InputError(
+            f"view {names[paths.index(None)]} has no photo",
+            hint=f"give views with photos, their {{images=DIR}}, or {otherwise}",
+        )
 
 
 def _choose_regularizers(

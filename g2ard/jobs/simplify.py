@@ -272,6 +272,7 @@ def open_reduction(
     scene: Splats | Source,
     tiling: Tiling | None = None,
     *,
+    budgets: Sequence[Budget] = (),
     counted: Callable[[int], None] = lambda total: None,
     given: GivenViews,
     **options: Any,
@@ -281,6 +282,7 @@ def open_reduction(
     Args:
         tiling: how to process the scene, a file, in tiles, which are only planned if `given` is rough; None
             for one piece.
+        budgets: checked before tiles are written.
         counted: called with the number of Gaussians before any work on them.
         options: other fields of `Reduction`.
     """
@@ -296,7 +298,14 @@ def open_reduction(
 
         config = options["config"]
         with open_tiles(
-            scene, tiling, 1.0, config, planned=given.rough, progress=progress, say=say
+            scene,
+            tiling,
+            1.0,
+            config,
+            budgets=budgets,
+            planned=given.rough,
+            progress=progress,
+            say=say,
         ) as tiles:
             counted(tiles.plan.count)
             yield Reduction(tiles.dense, given, notes=tiles.notes, plan=tiles.plan, **options)

@@ -173,8 +173,7 @@ def _merged(
 ) -> tuple[list[Path], list[int]]:
     """Merge all tiles to exactly `budget` Gaussians; return the results and their counts."""
     tiles = len(run.sizes)
-    if budget < tiles:
-        raise _unreached(tiles, budget, tiles, "one per tile")
+    check_reachable(budget, tiles)
     seen = [{"visibility": path} for path in sights.visibility] if sights else [{}] * tiles
     mean_run = max(1.0, sum(run.sizes) / (run.config["morton_premerge_ratio"] * budget))
     given: list[dict[str, Any]] = [{"frame": frame, "mean_run": mean_run, **one} for one in seen]
@@ -217,8 +216,7 @@ def shares(sizes: Sequence[int], budget: int) -> list[int]:
     """
     tiles = len(sizes)
     total = sum(sizes)
-    if budget < tiles:
-        raise _unreached(tiles, budget, tiles, "one per tile")
+    check_reachable(budget, tiles)
     ends = [
         rows * (budget - tiles) // max(1, total - tiles)
         for rows in accumulate(n - 1 for n in sizes)
@@ -277,6 +275,12 @@ def _runs(run: TiledRun, costs: list[Path], budget: int) -> tuple[list[int], lis
 
 def _costs_of(path: Path) -> Callable[[], Float32]:
     return lambda: load(path, "costs")[0]
+
+
+def check_reachable(budget: int, tiles: int) -> None:
+    """Reject a budget of less than one Gaussian per tile."""
+    if budget < tiles:
+        raise _unreached(tiles, budget, tiles, "one per tile")
 
 
 def _unreached(count: int, budget: int, tiles: int, why: str) -> InputError:

@@ -29,7 +29,7 @@ from g2ard.tiles.dense import InTiles
 from g2ard.tiles.executor import Workers, executor
 from g2ard.tiles.ingest import ingest
 from helpers.cloud_files import columns, ply
-from helpers.commands import CommandLine, succeeds
+from helpers.commands import CommandLine, refused, succeeds
 from helpers.photos import photographed
 from helpers.project import environment
 from helpers.scenes import views_at
@@ -388,6 +388,43 @@ def test_a_cloud_streams_into_tiles(command_line: CommandLine, tmp_path: Path) -
     )
     report = json.loads((tmp_path / "photographed" / "report.json").read_text())
     assert (report["against"], report["tiles"]) == ("photos", 3)
+
+
+@pytest.mark.parametrize(
+    ("command", "said"),
+    [
+        ("simplify town.ply -n 3001", "expected a budget of at most 3,000, got 3,001"),
+        ("distill town.ply -n 3001", "expected a budget of at most 3,000, got 3,001"),
+        ("simplify town.ply -n 3", "the 4 tiles keep at least 4 Gaussians"),
+        ("distill town.ply -r 1000", "the 4 tiles keep at least 4 Gaussians"),
+        ("distill cloud.ply -n 300 --views views.json", "view 0 has no photo"),
+    ],
+)
+def test_requests_out_of_reach_are_refused_before_tiles_are_written(
+    command_line: CommandLine,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    command: str,
+    said: str,
+) -> None:
+    town_in(tmp_path, 3000)
+    points = np.random.default_rng(0).uniform(size=(3000, 3))
+    write_points(tmp_path / "cloud.ply", Points(points, np.full((3000, 3), 0.5)))
+    before = sorted(tmp_path.iterdir())
+
+    def write_nothing(*_: object, **__: object) -> None:
+        raise AssertionError("tiles are written")
+
+    monkeypatch.setattr("g2ard.tiles.ingest.ingest", write_nothing)
+    words = [
+        *command.split(),
+        "--tile-rows",
+        800,
+        "-o",
+        "out.ply" if "simplify" in command else "run",
+    ]
+    assert said in refused(command_line, tmp_path, *words, status=1)
+    assert sorted(tmp_path.iterdir()) == before
 
 
 def test_tiles_make_a_folder_of_sog(

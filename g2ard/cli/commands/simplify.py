@@ -121,15 +121,13 @@ def simplify(
     def counted(total: int) -> None:
         for each in named:
             each.check(total)
-        if how is not None:
-            for budget in filter(lambda one: one.bytes is None, budgets):
-                budget.of(total, str(scene))
 
     began = time.perf_counter()
     reports = []
     opening = open_reduction(
         source,
         how,
+        budgets=budgets,
         counted=counted,
         given=GivenViews(given, None, up, run.seed, rough=dry_run, **run.callbacks),
         blind=no_views,
