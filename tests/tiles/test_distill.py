@@ -357,6 +357,17 @@ def test_options_work_at_any_size(
         assert (tmp_path / "run" / "scene.sog").stat().st_size <= 20_000
 
 
+@pytest.mark.parametrize("options", [("--fit", "20kB"), ("--fit", "quest3"), ("--min-psnr", 18)])
+def test_budgets_of_simplify_work_in_tiles(
+    options: tuple[object, ...], command_line: CommandLine, folder: Path, tmp_path: Path
+) -> None:
+    call = ("simplify", folder / "town.ply", "--views", folder / "views.json", *options)
+    rows = ("--tile-rows", 4000, "--workers", 1, "--json", "-")
+    made = json.loads(succeeds(command_line, tmp_path, *call, *rows, "-o", "small.ply").out)
+    assert len(read_splats(tmp_path / "small.ply")) == made["output_count"] <= 9000
+    assert [path.name for path in tmp_path.iterdir()] == ["small.ply"]
+
+
 def test_a_cloud_streams_into_tiles(command_line: CommandLine, tmp_path: Path) -> None:
     scene = town(3000)
     colors = np.clip(0.5 + 0.28 * scene.sh0[:, 0], 0, 1)

@@ -176,8 +176,8 @@ def simplify(
             _tell_result(run, source, reduce, small, place, seconds["total"])
             if one.bytes is not None:
                 run.say(f"{place}: {written_bytes(place):,} of {one.bytes:,} bytes")
-    run.results(reports)
-    tell_quality(run, wanted[0], small.splats)
+        run.results(reports)
+        tell_quality(run, wanted[0], small.splats)  # reads files of tiles
 
 
 def _tell_plan(run: Run, reduce: Reduction, counts: Sequence[int]) -> None:
