@@ -22,7 +22,7 @@ from g2ard.tiles.ingest import ingest
 from helpers.commands import CommandLine, refused, succeeds
 from helpers.photos import photographed
 from helpers.ply_files import save
-from helpers.scenes import checkered_ball, under_a_sky
+from helpers.scenes import around, checkered_ball, under_a_sky
 from helpers.skies import courtyard
 from helpers.tiled_scenes import ring, town
 
@@ -75,6 +75,7 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     save(
         folder / "bare.ply", dict(zip("xyz", dense.means.T.astype(float), strict=True)), dtype="f8"
     )
+    g2ard.save_views(folder / "around.json", around(24, (64, 48)))
     views, splits = ring(16), ["train"] * 12 + ["test"] * 4
     g2ard.save_views(folder / "views.json", views, splits=splits)
     g2ard.save_views(folder / "photos.json", photographed(folder, dense, views), splits=splits)
@@ -129,19 +130,10 @@ def test_every_method_works_in_tiles(
 def test_rounds_begin_where_memory_holds_them(
     inputs: Path, command_line: CommandLine, tmp_path: Path
 ) -> None:
-    call = (
-        "distill",
-        inputs / "object.ply",
-        "-n",
-        300,
-        "--preset",
-        "paper",
-        "--size",
-        64,
-        "--no-page",
-    )
+    call = ("distill", inputs / "object.ply", "-n", 300, "--preset", "paper", "--no-page")
+    given = ("--views", inputs / "around.json", "--focus", "far")
     few = ("--set", "recover.schedule.round_steps=5", "--steps", 10)
-    one, other = both(command_line, tmp_path, *call, *few, output="")
+    one, other = both(command_line, tmp_path, *call, *given, *few, output="")
     counts, tiled = ([entry["count"] for entry in report["rounds"]] for report in (one, other))
     assert tiled == [count for count in counts if count <= 700]
     assert len(tiled) > 1
