@@ -33,6 +33,7 @@ SHRUNK = """
 [distill]
 size = 48
 steps = 5
+focus = "far"
 [lod]
 size = 48
 steps = 5

@@ -221,8 +221,9 @@ def test_results_of_a_cloud_stand_upright_in_every_command(
     run("simplify", "lift.ply", "-r", "4", "--method", "paper", "-o", "paper.ply")
     run("ingest", "map.las", "-o", "tiles", "--tile-rows", "800")
     run("simplify", "tiles", "-r", "4", "--no-views", "-o", "tiled.ply")
-    run("distill", "map.las", "-r", "4", "--steps", "3", "--size", "64", "-o", "run")
-    run("distill", "tiles", "-r", "4", "--steps", "3", "--size", "64", "-o", "tiled_run")
+    small = ("--steps", "3", "--size", "64", "--focus", "far", "--no-page")
+    run("distill", "map.las", "-r", "4", *small, "-o", "run")
+    run("distill", "tiles", "-r", "4", *small, "-o", "tiled_run")
     run(
         "recover",
         "small.ply",
