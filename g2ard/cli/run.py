@@ -26,7 +26,7 @@ from g2ard.io.scene_formats import axes_note, scene_format
 from g2ard.io.scenes import tell, write_scene
 from g2ard.pipeline.presets import configure
 from g2ard.progress import Detail
-from g2ard.system import devices, spill
+from g2ard.system import devices
 
 if TYPE_CHECKING:
     from g2ard.io.stream import SceneStream
@@ -175,6 +175,8 @@ class Run(Claims):
 
     def tell_notes(self) -> None:
         """Report full disks and GPU fallbacks since the last call, and warn once of a software renderer."""
+        from g2ard.system import spill  # it loads NumPy, which --help does without
+
         for note in spill.notes():
             self.console.say(note)
         if self.device in ("auto", "gpu"):
