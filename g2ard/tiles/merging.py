@@ -268,7 +268,7 @@ def _runs(run: TiledRun, costs: list[Path], budget: int) -> tuple[list[int], lis
             faint.append(min(missing, size - drawn))
             missing -= faint[-1]
         return kept, faint
-    target = min(sum(kept), int(run.pairs_per_row(budget) * budget))
+    target = int(min(sum(kept), run.pairs_per_row(budget) * budget))
     closed = cheapest([_costs_of(path) for path in costs], sum(kept) - max(target, len(kept)))
     return [n - c for n, c in zip(kept, closed, strict=True)], [0] * len(kept)
 

@@ -64,12 +64,13 @@ def reduced(
     budget: int = 900,
     views: Cameras | None = None,
     *,
+    config: SimplifyConfig | None = None,
     progress: Progress = silent,
     **where: Any,
 ) -> Splats:
     """Simplify in tiles without poses of its own; `where` are arguments of `executor`."""
     with executor(**where) as runs:
-        run = TiledRun(store, Workers(runs, work, progress), SimplifyConfig())
+        run = TiledRun(store, Workers(runs, work, progress), config or SimplifyConfig())
         return simplify_tiles(run, budget, views).splats.whole()
 
 

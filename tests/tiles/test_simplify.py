@@ -8,6 +8,7 @@ import time
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
+from typing import get_type_hints
 
 import numpy as np
 import pytest
@@ -26,7 +27,7 @@ from g2ard.scene.prepared import finite_rows_of
 from g2ard.scene.splats import Splats
 from g2ard.stages.evaluate import evaluate
 from g2ard.stages.lift import lift
-from g2ard.stages.simplify import SimplifyConfig, simplify
+from g2ard.stages.simplify import Pairs, SimplifyConfig, simplify
 from g2ard.stages.simplify.gaps import opacity_lost
 from g2ard.tiles.dense import InTiles
 from g2ard.tiles.executor import Workers, executor
@@ -294,6 +295,18 @@ def test_budgets_out_of_reach_are_refused(store: TileStore, tmp_path: Path) -> N
         InputError, match=r"the 4 tiles keep at least 4 Gaussians \(one per tile\), got 2"
     ):
         reduced(store, tmp_path, budget=2)
+
+
+def _unbounded_settings() -> list[str]:
+    """Return the names of the default method's settings that may be infinite."""
+    hints = get_type_hints(Pairs, include_extras=True)
+    return [name for name, hint in hints.items() if "inf]" in str(hint)]
+
+
+@pytest.mark.parametrize("name", _unbounded_settings())
+def test_settings_may_be_infinite(name: str, store: TileStore, tmp_path: Path) -> None:
+    config = SimplifyConfig(method="default", **{name: np.inf})
+    assert len(reduced(store, tmp_path, 900, config=config)) == 900
 
 
 @pytest.mark.parametrize("uneven", [False, True])
