@@ -388,6 +388,7 @@ def test_a_cloud_streams_into_tiles(command_line: CommandLine, tmp_path: Path) -
         *rows,
     )
     distilled = ("distill", "cloud.ply", "-n", 300, "--steps", 4, "--size", 64, "--no-page")
+    distilled = (*distilled, "--focus", "far")
     succeeds(command_line, tmp_path, *distilled, *rows, "-o", "run")
     report = json.loads((tmp_path / "run" / "report.json").read_text())
     assert (report["tiles"], report["lifted"], report["output_count"]) == (3, True, 300)
