@@ -17,11 +17,7 @@ WHITE: Colour = (1.0, 1.0, 1.0)
 
 LengthUnit = Literal["m", "ft", "us-ft"]
 """Units of scenes on a globe."""
-UNITS: dict[LengthUnit, float] = {
-    "m": 1.0,
-    "ft": 0.3048,
-    "us-ft": 1200 / 3937,
-}
+UNITS: dict[LengthUnit, float] = {"m": 1.0, "ft": 0.3048, "us-ft": 1200 / 3937}
 """Unit → its metres."""
 
 Method = Literal["default", "fast", "paper"]
@@ -31,14 +27,7 @@ Policy = Literal["auto", "directional"]
 """Policies of view selection."""
 POLICIES: tuple[Policy, ...] = get_args(Policy)
 
-PoolKind = Literal[
-    "auto",
-    "orbit",
-    "walk",
-    "aerial",
-    "inside",
-    "sharp",
-]
+PoolKind = Literal["auto", "orbit", "walk", "aerial", "inside", "sharp"]
 """Kinds of generated view pools (`g2ard.poses.make_pool`)."""
 POOL_KINDS: tuple[PoolKind, ...] = get_args(PoolKind)
 
@@ -78,24 +67,12 @@ RenderModel = Literal["classic", "antialiased"]
 """Renderings that scenes are trained for; antialiased is also called mip (`g2ard.rendering.renderer`)."""
 RENDER_MODELS: tuple[RenderModel, ...] = get_args(RenderModel)
 
+# fmt: off
 Axes = Literal[
-    "LDB",
-    "RDB",
-    "LUB",
-    "RUB",
-    "LDF",
-    "RDF",
-    "LUF",
-    "RUF",
-    "LFD",
-    "RFD",
-    "LFU",
-    "RFU",
-    "LBD",
-    "RBD",
-    "LBU",
-    "RBU",
+    "LDB", "RDB", "LUB", "RUB", "LDF", "RDF", "LUF", "RUF",
+    "LFD", "RFD", "LFU", "RFU", "LBD", "RBD", "LBU", "RBU",
 ]
+# fmt: on
 """Axes by the directions of x, y and z: left or right, down or up, back or forward."""
 AXES: tuple[Axes, ...] = get_args(Axes)
 AxesName = Literal[Axes, "y-up", "z-up"]
@@ -108,16 +85,7 @@ LpipsInput = Literal["scaled", "unscaled"]
 ViewFormat = Literal["g2ard", "inria", "nerfstudio", "colmap"]
 """Formats that views can be written to (`g2ard.io.views`)."""
 
-FormatName = Literal[
-    "ply",
-    "sog",
-    "spz",
-    "glb",
-    "compressed.ply",
-    "splat",
-    "usda",
-    "usdc",
-]
+FormatName = Literal["ply", "sog", "spz", "glb", "compressed.ply", "splat", "usda", "usdc"]
 """Formats that scenes can be written to (`g2ard.io.scene_formats`)."""
 
 

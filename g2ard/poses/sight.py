@@ -87,10 +87,7 @@ class Lens:
     def holds(self, x: Float, y: Float, z: Float) -> Mask:
         """Return (M,) whether points, right, down and ahead of the eye, are in the frame."""
         wide, tall = self.tangents
-        held = z > 0
-        held &= np.abs(x) < wide * z
-        held &= np.abs(y) < tall * z
-        return held
+        return (z > 0) & (np.abs(x) < wide * z) & (np.abs(y) < tall * z)
 
     @property
     def focal(self) -> float:
@@ -367,14 +364,7 @@ class Rays:
         columns, rows = _RAYS
         x = wide * ((np.arange(columns) + 0.5) / columns * 2 - 1)
         y = tall * ((np.arange(rows) + 0.5) / rows * 2 - 1)
-        rays = np.stack(
-            [
-                np.tile(x, rows),
-                np.repeat(y, columns),
-                np.ones(columns * rows),
-            ],
-            axis=1,
-        )
+        rays = np.stack([np.tile(x, rows), np.repeat(y, columns), np.ones(columns * rows)], axis=1)
         rays /= np.linalg.norm(rays, axis=1, keepdims=True)
         directions = np.einsum("ri,pij->prj", rays, poses.frames())
         self._site = survey.site
@@ -436,11 +426,7 @@ def gather(
     asked = 0
     good = 0
     while good < count and asked < patience * count:
-        more = min(
-            max(count - good, 16),
-            patience * count - asked,
-            _BLOCK,
-        )
+        more = min(max(count - good, 16), patience * count - asked, _BLOCK)
         poses, judged = tried(asked, asked + more)
         parts.append(poses)
         scores = np.concatenate([scores, judged])
