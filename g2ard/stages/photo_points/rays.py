@@ -271,7 +271,7 @@ def _refine(ray: _Rays, trial: Float, cost: Float) -> tuple[Float, Float]:
     offsets = np.linspace(-0.75, 0.75, _FINER_DEPTHS)
     tried = inverse_depth + offsets * spacing[:, :, None]
     finer = 1 / np.maximum(tried, 1e-3 * inverse_depth)
-    finer = finer.reshape(len(cost), -1)
+    finer = finer.reshape(len(cost), order.shape[1] * len(offsets))  # there may be no ray
     costs = ray.costs(finer)
     best = costs.argmin(1)
     return finer[rows, best], costs[rows, best]
