@@ -10,7 +10,7 @@ from g2ard.errors import InputError
 from g2ard.io.sog_write import palette_size
 from g2ard.io.tile_store import row_width
 from g2ard.jobs.clean import CLUTTER_SIDE, CLUTTER_VIEWS
-from g2ard.jobs.memory import RECOVERY_TIMES, TileMemory, format_bytes
+from g2ard.jobs.memory import RECOVERY_TIMES, TileMemory, format_bytes, whole_bytes
 from g2ard.jobs.run_views import limit_pixels
 from g2ard.pipeline.distill import plan_round_counts
 from g2ard.progress import plural
@@ -33,9 +33,6 @@ LARGEST_DENSE = 250_000
 """Largest dense scene that view.html shows beside the result: it adds at most 8 MB of SOG at SH degree 2."""
 _PROGRAM_BYTES = 65_000_000
 """Bytes of the interpreter and loaded libraries."""
-_SCENE_TIMES = 2.7
-"""Memory of simplification as a multiple of the scene's arrays. Measured, as the next, on 60,000 and 200,000
-Gaussians of SH degree 0 and 3."""
 _KEPT_TIMES = 2.0
 """Memory of the scene and its prepared copy, which stay until the end, as a multiple of its arrays."""
 _SURVEY = (35_000_000, 500)
@@ -130,7 +127,8 @@ def cost_of_reduction(reduce: Reduction, count: int) -> Cost:
     plan = reduce.plan
     if plan is not None:
         return Cost(views, 0, 0, plan.bytes, plan.disk)
-    memory = _PROGRAM_BYTES + int(_SCENE_TIMES * reduce.dense.sample.nbytes)
+    degree = reduce.dense.sample.sh_degree
+    memory = _PROGRAM_BYTES + whole_bytes(reduce.total, 4 * row_width(degree))
     memory += _sampled(_SURVEY, reduce.total) if views else 0
     return Cost(views, 0, 0, memory)
 
@@ -161,7 +159,8 @@ def _peak_bytes(job: DistillJob, count: int, page: bool, *, trains: bool) -> int
     if count < rows <= LARGEST_DENSE:  # shown beside the result
         packing = max(packing, _packing_bytes(dense, job.prior.sh_degree))
     written = _KEPT_TIMES * scene + max(_sampled(_LOOKS, dense), packing if page else 0)
-    held = kept + int(max(_SCENE_TIMES * scene, scene + trainer_bytes(count, degree), written))
+    merging = whole_bytes(dense, 4 * row_width(job.prior.sh_degree))
+    held = kept + int(max(merging, scene + trainer_bytes(count, degree), written))
     return held if job.plan is None else max(held, job.plan.bytes)
 
 

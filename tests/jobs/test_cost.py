@@ -146,9 +146,9 @@ def test_memory_grows_with_views_and_gaussians(monkeypatch: pytest.MonkeyPatch) 
     assert few.bytes > 12 * few.views * few.pixels
     assert many.bytes > few.bytes
     monkeypatch.setattr("g2ard.jobs.cost._LOOKS", (0, 0))  # packing takes less for a small scene
-    both = cost_of(job, 90)  # its page holds the dense scene too
+    both = cost_of(job, 450)  # its page holds the dense scene too
     monkeypatch.setattr("g2ard.jobs.cost.LARGEST_DENSE", 899)
-    assert both.bytes > cost_of(job, 90).bytes > cost_of(job, 90, page=False).bytes
+    assert both.bytes > cost_of(job, 450).bytes > cost_of(job, 450, page=False).bytes
 
 
 @pytest.mark.parametrize("pictured", [False, True])

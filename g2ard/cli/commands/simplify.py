@@ -72,7 +72,7 @@ def simplify(
     import numpy as np
 
     from g2ard.jobs.inputs import GivenViews
-    from g2ard.jobs.memory import WHOLE_TIMES, check_whole_memory
+    from g2ard.jobs.memory import check_whole_memory
     from g2ard.jobs.simplify import open_reduction, read_parents
     from g2ard.jobs.tile_options import is_tiled
     from g2ard.stages.simplify import SimplifyConfig
@@ -113,7 +113,7 @@ def simplify(
     if how is None:
         say_fit(run, scene, budgets[0], name)
         if source.kind != "points":
-            check_whole_memory(source, tiling, WHOLE_TIMES)
+            check_whole_memory(source, tiling)
     named = list(filter(None, (outputs, maps)))
     for each in named:
         each.check()
