@@ -82,10 +82,9 @@ def _data(views: ViewFiles, settings: Settings | None) -> tuple[Sequence[Frame],
         hint = f"give its transforms.json or COLMAP folder as views, or correct `data` in {CONFIG}"
         raise InputError(f"data {data.as_posix()} does not exist", path=folder / CONFIG, hint=hint)
     if parser == "ColmapDataParser":
-        files = ViewFiles(place / (options.path("colmap_path") or "colmap/sparse/0"))
+        model = place / (options.path("colmap_path") or "colmap/sparse/0")
         photos = views.images or place / (options.path("images_path") or "images")
-        if photos.is_dir():
-            files = replace(files, images=photos)
+        files = ViewFiles(model, photos if photos.is_dir() else None)
         return colmap.listed(files).whole(), _EYE, 1.0
     views = replace(views, path=place)
     if parser == "NerfstudioDataParser":

@@ -51,11 +51,9 @@ class Exposure(Report):
         names = targets.cameras.names
         rows = [view for view in range(len(names)) if against_of(targets, view) == "photo"]
         gains, offsets = np.moveaxis(exposures[rows], 2, 0)
-        return cls(
-            gain=(float(gains.min()), float(gains.max())),
-            offset=(float(offsets.min()), float(offsets.max())),
-            photos={names[row]: exposures[row].tolist() for row in rows},
-        )
+        gain = float(gains.min()), float(gains.max())
+        offset = float(offsets.min()), float(offsets.max())
+        return cls(gain, offset, {names[row]: exposures[row].tolist() for row in rows})
 
     def __str__(self) -> str:
         (dark, bright), (low, high) = self.gain, self.offset
