@@ -89,18 +89,19 @@ class Watched:
             if isinstance(kernel, BuiltinFunctionType) and name not in CHEAP:
                 monkeypatch.setattr(_core, name, partial(self._call, kernel))
         # the former without its cache
-        detect_file, open_source = detect._of_file.__wrapped__, Source._opened
+        detect_file, open_source = detect._of_file.__wrapped__, Source._open
 
         def detecting(path: Path, *more: Any) -> Any:
             self.detected[path.resolve().name] += 1
             return detect_file(path, *more)
 
         def opening(source: Source, *more: Any) -> Any:
-            self.opened[source.file.resolve().name] += 1
+            if not source.others:  # joined sources open each by itself
+                self.opened[source.file.resolve().name] += 1
             return open_source(source, *more)
 
         monkeypatch.setattr(detect, "_of_file", detecting)
-        monkeypatch.setattr(Source, "_opened", opening)
+        monkeypatch.setattr(Source, "_open", opening)
 
     def _call(self, kernel: Callable[..., Any], *arguments: Any, **named: Any) -> Any:
         stage = self.console and self.console._stage

@@ -214,14 +214,15 @@ def test_invalid_options_are_rejected_before_any_work(
 def test_errors_leave_no_copy_of_the_scene(
     command_line: CommandLine, place: Path, tmp_path: Path
 ) -> None:
-    tiled = ("simplify", place / "town.ply", *BLIND, "-o", "a.ply", "-n")
-    status, _, said = command_line(*tiled, 9999, cwd=tmp_path)
-    assert status == 1, said
-    assert not list(tmp_path.iterdir())
-    status, _, said = command_line(*tiled, 2, cwd=tmp_path)  # known once the steps are done
-    assert (status, "keep at least" in said, "kept in .a.ply.tiles" in said) == (1, True, True)
+    tiled = ("simplify", place / "town.ply", *BLIND, "-o", "a.ply")
+    for count in (9999, 2):
+        status, _, said = command_line(*tiled, "-n", count, cwd=tmp_path)
+        assert status == 1, said
+        assert not list(tmp_path.iterdir())
+    status, _, said = command_line(*tiled, "--fit", "page:1kB", cwd=tmp_path)  # after steps
+    assert (status, "too few" in said, "kept in .a.ply.tiles" in said) == (1, True, True)
     assert (tmp_path / ".a.ply.tiles" / "steps").is_dir()
-    succeeds(command_line, tmp_path, *tiled, 300)
+    succeeds(command_line, tmp_path, *tiled, "-n", 300)
     assert [path.name for path in tmp_path.iterdir()] == ["a.ply"]
 
 
