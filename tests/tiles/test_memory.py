@@ -105,4 +105,4 @@ def test_the_machines_memory_is_the_default(
 
 def test_no_more_tiles_are_advised_than_are_made() -> None:
     told = TileMemory(100_000_000, 56).advice(200_000_000, 50_000_000)
-    assert told == "the least that tiles take is about 206 MB, with --tile-rows 10,000"
+    assert told == "the least that tiles take is about 207 MB, with --tile-rows 10,000"
