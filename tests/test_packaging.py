@@ -1,4 +1,4 @@
-"""What is published beside the wheel: the container, and the site's index for language models."""
+"""Tests of files published beside the wheel: the container, and the site's index for language models."""
 
 import json
 import re

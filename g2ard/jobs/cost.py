@@ -39,8 +39,8 @@ _SURVEY = (35_000_000, 500)
 """Bytes, and bytes per Gaussian of a sample, that planning views or measuring visibility leaves."""
 _LOOKS = (20_000_000, 300)
 """Bytes, and bytes per Gaussian of a sample, that the choice of views to show takes beyond what planning left.
-Measured without a page on 20,000 to 400,000 Gaussians of SH degree 0 and 3, views given: predictions are 0.84 to
-1.27 times the peak."""
+Measured without a page on 20,000 to 400,000 Gaussians of SH degree 0 and 3, views given: predictions are 0.79 to
+1.21 times the peak."""
 _SAMPLE = 150_000
 """Largest sample on which views are planned and chosen."""
 _IMAGE_BYTES = 60

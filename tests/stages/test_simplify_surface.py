@@ -1,4 +1,4 @@
-"""How far merged Gaussians widen: surfaces of one layer stay closed, layers on each other stay sharp."""
+"""Widths of merged Gaussians: surfaces of one layer stay closed, layers on each other stay sharp."""
 
 import math
 from collections.abc import Callable
